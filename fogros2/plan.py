@@ -9,6 +9,7 @@ from decimal import Decimal
 import ipaddress
 import os
 from pathlib import Path
+import re
 import sys
 from typing import Any, Optional
 
@@ -105,6 +106,18 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
                 "use bootstrap='apt' (Ubuntu 24.04), or unset RMW_IMPLEMENTATION")
 
 
+def read_domain(text: str) -> int:
+    """
+    Return the number in a ROS_DOMAIN_ID, read as rcl does: octal after 0, hexadecimal after 0x.
+
+    :raises ConfigurationError: it is not a number.
+    """
+    try:
+        return int(re.sub('^0+(?=[0-7])', '0o', text.strip() or '0'), 0)
+    except ValueError:
+        raise ConfigurationError(f'ROS_DOMAIN_ID={text} is no number', 'use 0 to 101') from None
+
+
 def check_domain(domain: int, specs: Iterable[MachineSpec]) -> None:
     """
     Check that the nodes of machines are in the launch's ROS domain.
@@ -112,11 +125,11 @@ def check_domain(domain: int, specs: Iterable[MachineSpec]) -> None:
     :raises DdsError: they and the robot's nodes would not hear each other.
     """
     for spec in specs:
-        own = spec.environment.get('ROS_DOMAIN_ID', str(domain)) or '0'
-        if own != str(domain):
+        own = spec.environment.get('ROS_DOMAIN_ID', str(domain))
+        if read_domain(own) != domain:
             raise DdsError(
-                f"the nodes of machine '{spec.name}' would have ROS_DOMAIN_ID={own}, those here "
-                f'{domain}: they would not hear each other',
+                f"the nodes of machine '{spec.name}' would have ROS_DOMAIN_ID={own or 0}, those "
+                f'here {domain}: they would not hear each other',
                 'set ROS_DOMAIN_ID for the whole launch, before it')
 
 

@@ -252,17 +252,14 @@ class Launch:
 
         :raises ConfigurationError: ROS_DOMAIN_ID is not a number.
         """
-        text = self.user_environment.get('ROS_DOMAIN_ID') or '0'
-        try:
-            return int(text)
-        except ValueError:
-            raise ConfigurationError(f'ROS_DOMAIN_ID={text} is no number',
-                                     'use 0 to 101') from None
+        return plan.read_domain(self.user_environment.get('ROS_DOMAIN_ID', ''))
 
     def drops(self, environment: Mapping[str, str]) -> bool:
         """Return whether the robot's filter drops the DDS of a node with these variables."""
-        own = environment.get('ROS_DOMAIN_ID') or '0'
-        return own != str(self.domain) and bool(self.dds().ports)
+        with contextlib.suppress(ConfigurationError):  # the node itself refuses to start
+            own = plan.read_domain(environment.get('ROS_DOMAIN_ID', ''))
+            return own != self.domain and bool(self.dds().ports)
+        return False
 
     # -- the robot ------------------------------------------------------------------------------
 

@@ -392,7 +392,7 @@ def lan_peers(seconds: float) -> Check:
     if seconds <= 0:
         return Check(name, 'ok', 'not looked for')
     try:
-        domain = int(os.environ.get('ROS_DOMAIN_ID') or 0)
+        domain = plan.read_domain(os.environ.get('ROS_DOMAIN_ID', ''))
         if not 0 <= domain <= lan.HIGHEST_DOMAIN:
             raise ValueError(f'ROS_DOMAIN_ID is {domain}, not 0 to {lan.HIGHEST_DOMAIN}')
         counts = lan.participants(domain, seconds)

@@ -153,7 +153,8 @@ def test_machines_that_no_node_would_hear_are_not_created(
 
 @pytest.mark.parametrize(('dds', 'environment', 'drops'), [
     ('fastdds', {}, True), ('fastdds', {'ROS_DOMAIN_ID': '5'}, True),
-    ('fastdds', {'ROS_DOMAIN_ID': '3'}, False), ('zenoh', {'ROS_DOMAIN_ID': '5'}, False)])
+    ('fastdds', {'ROS_DOMAIN_ID': '3'}, False), ('fastdds', {'ROS_DOMAIN_ID': '03'}, False),
+    ('fastdds', {'ROS_DOMAIN_ID': 'x'}, False), ('zenoh', {'ROS_DOMAIN_ID': '5'}, False)])
 def test_filter_drops_dds_of_other_domains(launch, monkeypatch, dds, environment, drops):
     monkeypatch.setattr(plan, 'check_rmw', lambda *_: None)
     launch.user_environment['ROS_DOMAIN_ID'] = '3'

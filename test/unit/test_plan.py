@@ -211,12 +211,21 @@ def test_a_middleware_has_to_be_there_and_to_be_one_for_all(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(('environment', 'own'), [
     ({}, ''), ({'ROS_DOMAIN_ID': '3'}, ''), ({'ROS_DOMAIN_ID': '5'}, '5'),
-    ({'ROS_DOMAIN_ID': ''}, '0')])
+    ({'ROS_DOMAIN_ID': ''}, '0'), ({'ROS_DOMAIN_ID': '0x3'}, '')])
 def test_machine_has_the_domain_of_the_launch(environment: dict[str, str], own: str) -> None:
     specs = [MachineSpec('n', 'ssh'), MachineSpec('m', 'ssh', environment=environment)]
     refused = pytest.raises(DdsError, match=f"'m' would have ROS_DOMAIN_ID={own}, those here 3")
     with refused if own else contextlib.nullcontext():
         plan.check_domain(3, specs)
+
+
+@pytest.mark.parametrize(('text', 'domain'), [
+    ('', 0), ('0', 0), ('05', 5), ('010', 8), ('0x10', 16), (' 42', 42), ('101', 101)])
+def test_domain_is_read_as_nodes_read_it(text: str, domain: int) -> None:
+    assert plan.read_domain(text) == domain
+    for wrong in ('08', 'x', '1.5'):
+        with pytest.raises(ConfigurationError, match='is no number'):
+            plan.read_domain(wrong)
 
 
 @pytest.mark.parametrize('name', ['fastdds', 'fastrtps', 'rmw_fastrtps_cpp'])
