@@ -40,6 +40,8 @@ from fogros2.vpn.addresses import dds_ports, DISCOVERY_GROUP, multicast_group
 
 #: Environment variable with the path of Fast DDS's profiles.
 VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+#: File that Fast DDS reads in the working directory.
+DEFAULT_FILE = 'DEFAULT_FASTRTPS_PROFILES.xml'
 NAMESPACE = 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'
 #: Number of processes that a host without multicast is asked for; ROS 2 asks as many.
 ASKED = 32
@@ -113,7 +115,7 @@ class FastDds(DdsVendor):
 
     def asked(self, user: Mapping[str, str]) -> list[str]:
         """Return the hosts of ROS_STATIC_PEERS, and those of the user's profiles."""
-        root, _ = _profiles(user.get(VARIABLE, ''))
+        root, _ = _profiles(_file(user))
         return [*static_peers(user), *(
             (address.text or '').strip() for address in root.iter('address'))]
 
@@ -158,8 +160,9 @@ class FastDds(DdsVendor):
         :param quiet: announce no group.
         :raises DdsError: the user's profiles cannot be read, or configure transports.
         """
-        root, profiles = _profiles(user.get(VARIABLE, ''))
-        participant = _default_participant(profiles)
+        path = _file(user)
+        root, profiles = _profiles(path)
+        participant = _default_participant(profiles, path)
         rtps = _child(participant, 'rtps')
         kept = _child(_child(rtps, 'allocation'), 'remote_locators')
         limit = _child(kept, 'max_unicast_locators')
@@ -229,11 +232,19 @@ class FastDds(DdsVendor):
         :raises DdsError: the user's environment disables discovery.
         """
         check_discovery(user)
-        variables = {'RMW_IMPLEMENTATION': self.rmw, VARIABLE: path,
+        # in a node's folder, the default file would replace our participant
+        variables = {'RMW_IMPLEMENTATION': self.rmw, VARIABLE: path, 'SKIP_DEFAULT_XML_FILE': '1',
                      'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT'}
         if user.get('ROS_LOCALHOST_ONLY') == '1':
             variables['ROS_LOCALHOST_ONLY'] = '0'
         return variables
+
+
+def _file(user: Mapping[str, str]) -> str:
+    """Return the path of the user's profiles, '' without any; machines have no user."""
+    if user.get(VARIABLE) or not user or user.get('SKIP_DEFAULT_XML_FILE') == '1':
+        return user.get(VARIABLE, '')
+    return DEFAULT_FILE if Path(DEFAULT_FILE).exists() else ''
 
 
 def _profiles(path: str) -> tuple[Element, Element]:
@@ -244,11 +255,11 @@ def _profiles(path: str) -> tuple[Element, Element]:
     try:
         root = ElementTree.fromstring(Path(path).read_bytes())
     except OSError as error:
-        raise DdsError(f"{VARIABLE} names {path}, which can't be read: {error.strerror}",
+        raise DdsError(f"the profiles {path} of Fast DDS can't be read: {error.strerror}",
                        f'correct or unset {VARIABLE}') from error
     except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise DdsError(f'{path} of {VARIABLE} is no XML: {error}',
-                       f'correct it or unset {VARIABLE}') from error
+        raise DdsError(f'{path} is no XML with profiles of Fast DDS: {error}',
+                       f'correct it, or unset {VARIABLE}') from error
     for element in root.iter():
         element.tag = re.sub('^{.*}', '', element.tag)
     root.set('xmlns', NAMESPACE)
@@ -257,7 +268,7 @@ def _profiles(path: str) -> tuple[Element, Element]:
     return root, _child(root, 'profiles')
 
 
-def _default_participant(profiles: Element) -> Element:
+def _default_participant(profiles: Element, file: str) -> Element:
     for participant in profiles.iter('participant'):
         if participant.get('is_default_profile') == 'true':
             for path, values, effect in _REFUSED:
@@ -265,7 +276,7 @@ def _default_participant(profiles: Element) -> Element:
                     value = (setting.text or '').strip()
                     if value and value not in values:
                         raise DdsError(
-                            f'with {path}={value} of the default participant in {VARIABLE}, the '
+                            f'with {path}={value} of the default participant in {file}, the '
                             f"robot's nodes {effect}: they would not meet those of machines",
                             f'leave {path} out')
             return participant

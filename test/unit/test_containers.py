@@ -386,7 +386,8 @@ def test_fogros2_s_file_needs_cyclone_dds():
     (CycloneDds, 'CYCLONEDDS_URI=file:///run/dds.xml\n'
                  'RMW_IMPLEMENTATION=rmw_cyclonedds_cpp\nROS_DOMAIN_ID=7\n'),
     (FastDds, 'FASTRTPS_DEFAULT_PROFILES_FILE=/run/dds.xml\nRMW_IMPLEMENTATION=rmw_fastrtps_cpp\n'
-              'ROS_AUTOMATIC_DISCOVERY_RANGE=SYSTEM_DEFAULT\nROS_DOMAIN_ID=7\n'),
+              'ROS_AUTOMATIC_DISCOVERY_RANGE=SYSTEM_DEFAULT\nROS_DOMAIN_ID=7\n'
+              'SKIP_DEFAULT_XML_FILE=1\n'),
     (Zenoh, 'RMW_IMPLEMENTATION=rmw_zenoh_cpp\nROS_DOMAIN_ID=7\n'
             'ZENOH_SESSION_CONFIG_URI=/run/dds.xml\n'),
 ])

@@ -9,7 +9,14 @@ from xml.etree.ElementTree import Element
 
 import pytest
 
-from fogros2.dds.fastdds import ASKED, DISCOVERY_GROUP, FastDds, RECEIVE_BUFFER, VARIABLE
+from fogros2.dds.fastdds import (
+    ASKED,
+    DEFAULT_FILE,
+    DISCOVERY_GROUP,
+    FastDds,
+    RECEIVE_BUFFER,
+    VARIABLE,
+)
 from fogros2.errors import DdsError
 
 NS = {'': 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'}
@@ -177,6 +184,18 @@ def test_a_user_without_multicast_stays_out_of_the_common_group(tmp_path: Path) 
     text = robot(FastDds(), user)
     assert locators(text, 'metatrafficMulticastLocatorList') == [('239.18.7.1', '7402')]
     assert [host for host, _ in locators(text)] == ['192.168.1.5', '239.18.7.1', '239.18.7.2']
+
+
+def test_default_file_of_the_working_directory_is_taken_over(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    default_participant(tmp_path / DEFAULT_FILE, '<name>mine</name>')
+    monkeypatch.chdir(tmp_path)
+    user = {'HOME': '/root'}
+    assert parsed(robot(FastDds(), user)).findtext('.//name', '', NS) == 'mine'
+    # nodes read no such file
+    assert FastDds().environment('/x', user)['SKIP_DEFAULT_XML_FILE'] == '1'
+    for text in (machine(FastDds()), robot(FastDds(), {**user, 'SKIP_DEFAULT_XML_FILE': '1'})):
+        assert parsed(text).find('.//rtps/name', NS) is None
 
 
 @pytest.mark.parametrize(('content', 'words'), [
