@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import json
+import re
 from types import MappingProxyType
 from typing import Any, ClassVar, Optional
 
@@ -63,10 +64,10 @@ class Zenoh(DdsVendor):
                 "ZENOH_SESSION_CONFIG_URI makes nodes bypass the launch's router",
                 'unset it, and set your changes in ZENOH_CONFIG_OVERRIDE')
         override = user.get('ZENOH_CONFIG_OVERRIDE', '')
-        if any(word in override for word in ('connect/', 'mode=')):
+        if re.search(r'(^|;)[\s/]*(connect|listen|mode)\s*[=/]', override):
             raise DdsError(
                 f"ZENOH_CONFIG_OVERRIDE={override} makes nodes bypass the launch's router",
-                "leave 'connect/' and 'mode' out of it")
+                "leave 'connect', 'listen' and 'mode' out of it")
         return [DdsInterface(vpn)]
 
     def machine_interfaces(self, vpn: str) -> list[DdsInterface]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import socket
 
 from fogros2 import plan, process
-from fogros2.dds import Router
+from fogros2.dds import Router, VARIABLES
 from fogros2.errors import DdsError
 from fogros2.model import Command
 from fogros2.store import write_private
@@ -42,7 +42,7 @@ def run(router: Router, folder: Path, environment: Mapping[str, str]) -> Callabl
     Run the router beside the robot's nodes, again when it ends; return what ends it.
 
     :param folder: directory for its configuration and its log.
-    :param environment: the launch's environment variables.
+    :param environment: the launch's environment variables; those of DDS are for nodes only.
     :raises DdsError: the router's program is not installed.
     """
     programs = [path for prefix in plan.ament_prefixes(environment) if os.access(
@@ -58,7 +58,9 @@ def run(router: Router, folder: Path, environment: Mapping[str, str]) -> Callabl
         child = process.start(
             Command(('sh', '-c', _RUN, str(programs[0]), f'{PAUSE:g}')), stdin=theirs,
             stdout=log.fileno(), stderr=log.fileno(),
-            environment={**environment, router.variable: str(config)})
+            environment={
+                **{name: value for name, value in environment.items() if name not in VARIABLES},
+                router.variable: str(config)})
     os.close(theirs)
 
     def end() -> None:

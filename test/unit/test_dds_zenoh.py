@@ -52,7 +52,8 @@ def test_local_node_and_machine_meet_no_other_computer(
 
 @pytest.mark.parametrize('user', [
     {'ZENOH_SESSION_CONFIG_URI': '/mine'}, {'ZENOH_CONFIG_OVERRIDE': 'mode="client"'},
-    {'ZENOH_CONFIG_OVERRIDE': 'connect/endpoints=["tcp/a:1"]'}])
+    {'ZENOH_CONFIG_OVERRIDE': 'connect/endpoints=["tcp/a:1"]'},
+    {'ZENOH_CONFIG_OVERRIDE': 'adminspace/enabled=true; listen/endpoints=["tcp/[::]:0"]'}])
 def test_what_leads_nodes_elsewhere_is_refused(user: dict[str, str]) -> None:
     with pytest.raises(DdsError, match="bypass the launch's router") as caught:
         Zenoh().robot_interfaces(ROBOT, None, user)
@@ -61,3 +62,8 @@ def test_what_leads_nodes_elsewhere_is_refused(user: dict[str, str]) -> None:
         Zenoh().environment('/x', {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'off'})
     with pytest.raises(DdsError, match='300'):
         Zenoh(300)
+
+
+def test_override_that_leaves_nodes_at_their_router_is_allowed() -> None:
+    Zenoh().robot_interfaces(ROBOT, None, {
+        'ZENOH_CONFIG_OVERRIDE': 'scouting/gossip/autoconnect/peer=["peer"];open/return_mode=1'})

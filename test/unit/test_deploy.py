@@ -687,13 +687,13 @@ def test_router_of_the_robot_runs_again_until_its_launch_ends(tmp_path, monkeypa
     monkeypatch.setattr(robot_router, 'PAUSE', 0.01)
     program = tmp_path / 'lib/pack/router'
     program.parent.mkdir(parents=True)
-    program.write_text('#!/bin/sh\necho $$ $SETTINGS; exec sleep 60\n')
+    program.write_text('#!/bin/sh\necho $$ $ZENOH_CONFIG_OVERRIDE$SETTINGS; exec sleep 60\n')
     program.chmod(0o755)
     pipes, pipe = [], os.pipe
     monkeypatch.setattr(os, 'pipe', lambda: pipes.append(pipe()) or pipes[-1])
     end = robot_router.run(
         Router('pack', 'router', 'SETTINGS', 'text'), tmp_path,
-        {**os.environ, 'AMENT_PREFIX_PATH': str(tmp_path)})
+        {**os.environ, 'AMENT_PREFIX_PATH': str(tmp_path), 'ZENOH_CONFIG_OVERRIDE': 'of-nodes:'})
 
     def started(times):
         lines = [line.split() for line in (tmp_path / 'router.log').read_text().splitlines()]
