@@ -77,7 +77,7 @@ def rewrite(
 
 def remapped(node: NodeSpec, names: Mapping[str, str]) -> NodeSpec:
     """
-    Rename topics for a process, even if it remaps them itself.
+    Rename topics for a process, even if it remaps them itself, and in its ``qos_overrides``.
 
     A program without ROS arguments is returned unchanged.
 
@@ -105,9 +105,30 @@ def remapped(node: NodeSpec, names: Mapping[str, str]) -> NodeSpec:
         old, _, new = rule.partition(':=')
         pairs.append((old, new))
     rules = [f'{old}:={new}' for old, new in rewrite(pairs, names, namespace)]
-    rewritten: list[Text] = list(arguments)
+    rewritten: list[Text] = [_overrides(argument, names) for argument in arguments]
     for index, rule in zip(indices, rules):
         rewritten[index] = rule
     more = [argument for rule in rules[len(indices):] for argument in ('-r', rule)]
     return dataclasses.replace(
-        node, arguments=(*rewritten, *(('--ros-args', *more) if more else ())))
+        node, arguments=(*rewritten, *(('--ros-args', *more) if more else ())),
+        files={key: _overrides(text, names) for key, text in node.files.items()})
+
+
+def _overrides(text: Text, names: Mapping[str, str]) -> Text:
+    """
+    Rename topics in the parameters ``qos_overrides`` of an argument or a parameter file.
+
+    Nodes look these parameters up by the new name of a topic.
+    """
+    # in a file, the topic may be a key of its own, below qos_overrides
+    topic = re.compile(r'''(\bqos_overrides\.|^[ \t]+["']?)(%s)(?=\.|["']?:)''' % '|'.join(
+        map(re.escape, names)), re.MULTILINE)
+
+    def renamed(part: str) -> str:
+        if 'qos_overrides' not in part:
+            return part
+        return topic.sub(lambda match: match[1] + names[match[2]], part)
+
+    if isinstance(text, str):
+        return renamed(text)
+    return tuple(renamed(part) if isinstance(part, str) else part for part in text)

@@ -61,6 +61,21 @@ def test_what_is_no_remapping_stays() -> None:
     assert remapped(*words) == (*words, *OURS)
 
 
+def test_qos_overrides_have_the_new_name() -> None:
+    old, new = (
+        '/**:\n  ros__parameters:\n    frame: /camera\n'
+        f'    qos_overrides.{name}.publisher.depth: 1\n'
+        f'    qos_overrides:\n      {name}:\n        publisher: {{depth: 1}}\n      /camera2: x\n'
+        for name in ('/camera', '/fogros2/m/camera'))
+    override = 'qos_overrides.{}.subscription.reliability:=best_effort'
+    node = NodeSpec('id', 'name', 'p', 'e', (
+        '--ros-args', '-p', override.format('/camera'), '--params-file', ({'file': 'a'},)),
+        files={'a': old, 'b': (old, {'share': 'p'}), 'c': '/camera: 1'})
+    result = ros_names.remapped(node, NAMES)
+    assert result.arguments[2] == override.format('/fogros2/m/camera')
+    assert result.files == {'a': new, 'b': (new, {'share': 'p'}), 'c': '/camera: 1'}
+
+
 def test_a_rule_for_one_node_of_several() -> None:
     assert remapped('--ros-args', '-r', 'one:image:=/camera')[2] == (
         'one:image:=/fogros2/m/camera')
