@@ -252,11 +252,14 @@ def dds_variables(environment: Mapping[str, str]) -> str:
     """
     Return the content of the file with the variables of a container beside the nodes.
 
+    Variables that the machine's nodes do not have replace those of the image, too.
+
     :param environment: environment of the machine's nodes. The file's format has no values of
         several lines.
     """
-    return ''.join(f'{name}={environment[name]}\n' for name in _DDS_VARIABLES
-                   if '\n' not in environment.get(name, '\n'))
+    values = {name: environment.get(name, '') for name in _DDS_VARIABLES}
+    values['ROS_DOMAIN_ID'] = values['ROS_DOMAIN_ID'] or '0'
+    return ''.join(f'{name}={value}\n' for name, value in values.items() if '\n' not in value)
 
 
 def called(container: Container, number: int, launch: str) -> str:
@@ -374,7 +377,8 @@ def inside(
     return dataclasses.replace(
         node, package='', executable='', prefix=(), cwd=None,
         features={name: each for name, each in node.features.items() if name != NAME},
-        files={**node.files, _OUTER: scripts.NODE.replace('@VARIABLES@', ' '.join(names)),
+        files={**node.files, _OUTER: scripts.NODE.replace(
+            '@VARIABLES@', ' '.join(names)).replace('@DDS@', ' '.join(_DDS_VARIABLES)),
                _INNER: scripts.INSIDE},
         arguments=(
             'sh', ({'file': _OUTER},), name, container.gpus, workspace, f'{grace:g}',

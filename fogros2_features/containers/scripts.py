@@ -159,6 +159,9 @@ umask 077
 list=$(mktemp "${FOGROS2_AGENT_DIRECTORY:-/tmp}/variables-XXXXXX") || exit 125
 newline='
 '
+# else the image's own would remain
+: "${ROS_DOMAIN_ID:=0}"
+for each in @DDS@; do eval ": \\"\\${$each=}\\""; done
 for each in @VARIABLES@; do
     eval "value=\\${$each-} given=\\${$each+yes}"
     case $value in *"$newline"*)

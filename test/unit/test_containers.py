@@ -394,15 +394,23 @@ def test_fogros2_s_file_needs_cyclone_dds():
 def test_container_gets_variables_of_the_middleware(vendor, variables):
     environment = {'ROS_DOMAIN_ID': '7', 'PATH': '/bin', 'ROS_STATIC_PEERS': 'a\nb',
                    **vendor(7).environment('/run/dds.xml', {})}
-    assert containers.dds_variables(environment) == variables
+    lines = containers.dds_variables(environment).splitlines(keepends=True)
+    assert ''.join(line for line in lines if not line.endswith('=\n')) == variables
+
+
+def test_container_keeps_no_dds_settings_of_its_image():
+    lines = containers.dds_variables({}).splitlines()
+    assert lines.count('ROS_DOMAIN_ID=0') == 1
+    assert {'ROS_LOCALHOST_ONLY=', 'ROS_DISCOVERY_SERVER=', 'ROS_STATIC_PEERS='} < {*lines}
 
 
 def test_containers_start_with_the_middleware_of_the_machine(engine, monkeypatch):
     monkeypatch.setenv('THERE', 'ros:jazzy web')
     shell = FakeShell(handlers={'sh': here})
     started(shell, [parse('docker run ros:jazzy'), parse('docker run -p 80:80 web')])
-    assert shell.files['/var/lib/agent/container-variables'] == (
-        b'RMW_IMPLEMENTATION=rmw_fastrtps_cpp\nROS_DOMAIN_ID=7\n', 0o600)
+    text, mode = shell.files['/var/lib/agent/container-variables']
+    assert b'RMW_IMPLEMENTATION=rmw_fastrtps_cpp\n' in text and b'ROS_DOMAIN_ID=7\n' in text
+    assert mode == 0o600
     first, second = (line for line in notes() if ' run ' in line)
     assert first.endswith(
         ' --label fogros2-launch=abc --env-file /var/lib/agent/container-variables --network host'
@@ -427,7 +435,9 @@ case $1-$2 in
         esac ;;
     pull-*) [ "$3" != "$WRONG" ] || { echo "Error: $3: manifest unknown" >&2; exit 125; }
         echo "$3" ;;
-    create-*) echo looking ;;
+    create-*) for each; do case $each in
+            */variables-*) cat "$each" >"$NOTES.variables" ;; esac; done
+        echo looking ;;
     inspect-*) echo 0 ;;
     cp-*) for last in $HAS; do [ "$2" != "looking:$last" ] || exit 0; done; exit 1 ;;
     run-*) echo 'what apt says'
@@ -520,7 +530,10 @@ def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path)
     words = [word if isinstance(word, str) else str(tmp_path / word[0]['file'])
              for word in made.arguments]
     told = done(Command(tuple(words)), FOGROS2_AGENT_DIRECTORY=str(tmp_path),
-                ROS_DOMAIN_ID='7')[1]
+                ROS_DOMAIN_ID='', RMW_IMPLEMENTATION='rmw')[1]
+    lines = (tmp_path / 'notes.variables').read_text().splitlines()
+    # the image's own values do not remain
+    assert {'RMW_IMPLEMENTATION=rmw', 'ROS_DOMAIN_ID=0', 'ROS_DISCOVERY_SERVER='} < {*lines}
     gpus = '--gpus all' if engine == 'docker' else '--device nvidia.com/gpu=all'
     (create,) = (line for line in told if ' create ' in line)
     assert f' {gpus} ' in create and f' -v {tmp_path}:{tmp_path}:ro ' in create
