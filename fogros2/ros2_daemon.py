@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Write a program ``ros2`` with a separate daemon for one launch, or for one shell.
+Write a program ``ros2`` with a separate daemon for one launch and its terminals.
 
 ``ros2 topic``, ``ros2 node`` and others use a daemon, which the first of them starts. Each ROS
 domain of a computer has one, with the DDS configuration of the terminal that started it. A daemon
@@ -12,9 +12,12 @@ fails in every terminal after the launch has ended. The program of this module r
 from __future__ import annotations
 
 import contextlib
+from importlib.util import find_spec
 from pathlib import Path
 import random
 import socket
+import sys
+from typing import Optional
 
 from fogros2.errors import DeadlineExceeded, PrerequisiteError
 from fogros2.store import write_private
@@ -39,6 +42,18 @@ from ros2cli.cli import main
 
 sys.exit(main())
 '''
+
+
+def programs(folder: Path) -> Optional[Path]:
+    """
+    Return the folder to put first into PATH, so that ``ros2`` has the daemon of a launch.
+
+    :param folder: the launch's.
+    :returns: None where ROS 2's command line is missing, or has no daemon, as in the wheels.
+    """
+    if find_spec('ros2cli') is None or find_spec('ros2cli.daemon') is None:
+        return None
+    return install(folder, sys.executable)
 
 
 def install(folder: Path, python: str) -> Path:

@@ -10,11 +10,12 @@ import contextlib
 import dataclasses
 import functools
 import os
+from pathlib import Path
 import secrets
 import threading
 from typing import Optional
 
-from fogros2 import model, plan, plugin_system
+from fogros2 import model, plan, plugin_system, ros2_daemon
 from fogros2.dds import addresses_of, DdsVendor
 from fogros2.deploy import robot_router
 from fogros2.deploy.checks import (
@@ -303,6 +304,10 @@ class Launch:
                             f'ROS_STATIC_PEERS={router.beside[0]} connects machines to them, too'))
                 self._robot_environment = dict(vendor.environment(str(path), user))
             return dict(self._robot_environment)
+
+    def programs(self) -> Optional[Path]:
+        """Return the folder to put first into PATH of the robot's processes, None for none."""
+        return ros2_daemon.programs(self.store.launch_folder(self.id))
 
     def _write_interfaces(self) -> None:
         """Write the middleware's configuration for nodes of the robot that start from now on."""

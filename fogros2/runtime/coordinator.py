@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import copy
 import functools
+import os
 from pathlib import Path
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
@@ -121,6 +122,8 @@ class Coordinator:
         self._late: set[str] = set()
         #: What the DDS settings replaced, by variable.
         self._replaced: dict[str, Optional[str]] = {}
+        #: The folder with the launch's own ``ros2``.
+        self._programs: Optional[Path] = None
         #: The environment that the deployment got.
         self._users: Mapping[str, str] = {}
         self._on_machine: OnMachine
@@ -431,6 +434,7 @@ class Coordinator:
 
     def _set_dds_environment(self) -> None:
         environment = self.launch.robot_environment()
+        self._programs = self.launch.programs()
         for name in environment:
             self._replaced.setdefault(name, self.base_environment.get(name))
         self._replace('the launch file', environment, self._context.environment,
@@ -462,6 +466,9 @@ class Coordinator:
                     None, value, self._replaced[name], self._users.get(name))}
         for environment in environments:
             environment.update(settings)
+            paths = environment.get('PATH', os.defpath).split(os.pathsep)
+            if self._programs is not None and str(self._programs) not in paths:
+                environment['PATH'] = os.pathsep.join([str(self._programs), *paths])
         if lost:
             self._logger.warning(
                 f"the launch's DDS settings replace {', '.join(sorted(lost))} of {owner}, so that "
@@ -611,6 +618,10 @@ class Coordinator:
                 del environment[name]
             else:
                 environment[name] = value
+        if self._programs is not None:
+            environment['PATH'] = os.pathsep.join(
+                path for path in environment.get('PATH', '').split(os.pathsep)
+                if path != str(self._programs))
 
     def _in_thread(self, function: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:
         future: asyncio.Future[Any] = self._context.asyncio_loop.run_in_executor(

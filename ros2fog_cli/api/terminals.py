@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-import importlib.util
 import os
 from pathlib import Path
 import shlex
 import signal
-import sys
-from typing import NoReturn, Optional
+from typing import NoReturn
 
 from fogros2 import ros2_daemon
 from fogros2.errors import ConfigurationError
@@ -36,17 +34,10 @@ def launch_of(name: str, store: Store) -> tuple[Path, dict[str, str]]:
     return store.launch_folder(record.launch), variables
 
 
-def programs(folder: Path) -> Optional[Path]:
-    """Return the folder to put first into PATH: its ``ros2`` has the daemon of a launch."""
-    if importlib.util.find_spec('ros2cli.daemon') is None:
-        return None  # the embedded default has no daemon
-    return ros2_daemon.install(folder, sys.executable)
-
-
 def shell_lines(folder: Path, variables: Mapping[str, str]) -> list[str]:
     """Return lines for a POSIX shell whose nodes are in a launch; its end stops their daemon."""
     lines = [f'export {name}={shlex.quote(value)}' for name, value in sorted(variables.items())]
-    if (first := programs(folder)) is not None:
+    if (first := ros2_daemon.programs(folder)) is not None:
         lines.append(f'export PATH={shlex.quote(str(first))}:"$PATH"')
     return lines
 
@@ -66,7 +57,7 @@ def run(name: str, words: Sequence[str] = ()) -> NoReturn:
             '[ ! -f ~/.bashrc ] || . ~/.bashrc', *shell_lines(folder, variables),
             f'PS1="({shlex.quote(name)}) $PS1"', '']).encode())
         words = [words[0], '--rcfile', str(start), '-i']
-    path = [str(programs(folder) or ''), os.environ.get('PATH', os.defpath)]
+    path = [str(ros2_daemon.programs(folder) or ''), os.environ.get('PATH', os.defpath)]
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # Python ignores it
     try:
         os.execvpe(words[0], words, {

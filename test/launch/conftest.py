@@ -147,6 +147,7 @@ class FakeLaunch:
         #: Errors of the next requests to start nodes, one for each.
         self.start_errors = []
         self.prepare_error = None
+        self.ros2 = None
         self.down_errors = []
         self.spent = []
 
@@ -192,6 +193,9 @@ class FakeLaunch:
     def robot_environment(self):
         self.note('robot environment')
         return {'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp', 'CYCLONEDDS_URI': '<CycloneDDS/>'}
+
+    def programs(self):
+        return self.ros2
 
     def prepare(self, specs, nodes):
         self.note('prepare', [spec.name for spec in specs],

@@ -264,6 +264,16 @@ def test_robot_node_started_before_the_dds_is_warned_about(run, fake, planner, c
     assert f'{process.name} runs already' in capfd.readouterr().out
 
 
+def test_processes_of_the_robot_use_the_ros2_of_the_launch(run, fake, planner, tmp_path, capfd):
+    fake.on_start = ends
+    fake.ros2 = tmp_path / 'bin'
+    before = os.environ['PATH']
+    process = ExecuteProcess(cmd=['sh', '-c', 'echo path is $PATH'], output='screen')
+    assert run(LaunchDescription([process, talker(planner)])) == 0
+    assert f'path is {fake.ros2}:{before}' in capfd.readouterr().out
+    assert os.environ['PATH'] == before
+
+
 @pytest.mark.parametrize('first', [True, False])
 def test_dds_settings_of_a_part_of_the_launch_are_warned_about(run, fake, planner, capfd, first):
     fake.on_start = ends

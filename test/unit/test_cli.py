@@ -21,7 +21,7 @@ from unittest.mock import Mock
 import pytest
 from ros2cli.cli import main
 
-from fogros2 import process, report
+from fogros2 import process, report, ros2_daemon
 from fogros2.deploy import undo
 from fogros2.errors import (
     ConnectError,
@@ -46,7 +46,7 @@ from fogros2.vpn.wireguard import WireGuard
 from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream
 from fogros2_testing.plugins import instead
 from rigs import recorded_agent
-from ros2fog_cli.api import endings, machines, table, terminals
+from ros2fog_cli.api import endings, machines, table
 from ros2fog_cli.api.machines import Entry
 
 NOW = 1_800_000_000.0
@@ -694,7 +694,7 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
         'RMW_IMPLEMENTATION'] == 'rmw_cyclonedds_cpp'
     # ROS 2's own ros2 has a daemon, which gets a port of this launch
     found = importlib.util.find_spec('os')
-    monkeypatch.setattr(terminals.importlib.util, 'find_spec', lambda name: found)
+    monkeypatch.setattr(ros2_daemon, 'find_spec', lambda name: found)
     assert run('env', 'a') == 0
     shown = subprocess.run(['sh', '-c', f'{capsys.readouterr().out}\ncommand -v ros2'],
                            capture_output=True, text=True, check=True).stdout.strip()
@@ -742,7 +742,7 @@ def test_shell_becomes_a_command_in_the_launch(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, joined: Path, daemon: bool,
 ) -> None:
     found = importlib.util.find_spec('os' if daemon else 'no_such_module')
-    monkeypatch.setattr(terminals.importlib.util, 'find_spec', lambda name: found)
+    monkeypatch.setattr(ros2_daemon, 'find_spec', lambda name: found)
     script = 'echo "$ROS_DOMAIN_ID $RMW_IMPLEMENTATION"; command -v ros2; exit 5'
     assert become('--', 'sh', '-c', script) == 5
     first, where = capfd.readouterr().out.splitlines()
