@@ -13,9 +13,9 @@ Discovery uses multicast. WireGuard sends a packet to the one peer that its dest
 so each host has a group of its own (``vpn.addresses``), to which the others send announcements and
 descriptions of topics. One packet is for all processes of the host. By unicast each process would
 send each of them to each process: the traffic of 100 processes would be ten times as much. Only
-the robot also listens to the common group, for its LAN, unless it is limited to itself. In
-another robot's VPN it announces no group: it may be in several, with an address in each. Processes
-that use the default announce none either.
+the robot also listens to the common group, for its LAN, unless it is limited to itself or the
+user's profile has no multicast. In another robot's VPN it announces no group: it may be in
+several, with an address in each. Processes that use the default announce none either.
 
 Nodes use UDP only. Shared memory, which Fast DDS uses by default, carries nothing between two
 accounts, or between containers with a common network, and reports no error: the segments of one
