@@ -397,8 +397,8 @@ def robot_id(*, new: bool = True) -> str:
     """
     Return this robot's id in tags: its name, and random digits that belong to this computer.
 
-    The digits are in the file ``robot.json`` of the configuration folder, with the computer's
-    machine-id and one MAC address. A copy of the file on another computer gets new digits.
+    The digits are in the file ``robot.json`` of the configuration folder, by the computer's
+    machine-id and one MAC address. Another computer with the file, or a copy of it, adds its own.
 
     :param new: make digits if there are none; else return the name alone.
     :raises StoreError: the file can't be written.
@@ -448,19 +448,19 @@ def _digits(folder: Path, *, new: bool) -> str:
         fcntl.flock(file, fcntl.LOCK_EX if new else fcntl.LOCK_SH)
         file.seek(0)
         try:
-            identity = json.load(file)
-            digits, bound = str(identity['digits']), (identity['machine_id'], identity['mac'])
-        except (ValueError, LookupError, TypeError):
-            digits, bound = '', ('', '')
-        if digits and bound[0] == machine_id and bound[1] in (addresses or ['']):
-            return digits
+            known: dict[str, str] = dict(json.load(file))
+        except (ValueError, TypeError):
+            known = {}
+        computers = [f'{machine_id} {address}' for address in addresses or ['']]
+        for computer in computers:
+            if known.get(computer):
+                return known[computer]
         if not new:
             return ''
-        digits = secrets.token_hex(4)
+        known[computers[0]] = secrets.token_hex(4)
         file.truncate(0)
-        json.dump({'digits': digits, 'machine_id': machine_id,
-                   'mac': addresses[0] if addresses else ''}, file)
-        return digits
+        json.dump(known, file)
+        return known[computers[0]]
 
 
 def mac_addresses(folder: Path = Path('/sys/class/net')) -> list[str]:

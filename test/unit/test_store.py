@@ -229,6 +229,15 @@ def test_readers_find_digits_that_they_may_not_write(monkeypatch, tmp_path):
     assert robot_id(new=False) == robot_id() == known and not is_another_robot(known)
 
 
+def test_computers_with_one_home_keep_their_ids(monkeypatch, tmp_path):
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
+    ids = []
+    for end in 'aba':
+        monkeypatch.setattr(store_module, 'mac_addresses', lambda end=end: [f'02::{end}'])
+        ids.append(robot_id())
+    assert ids[0] == ids[2] != ids[1]
+
+
 def test_volume_of_the_docker_command_keeps_id_and_state(monkeypatch):
     file = (ROOT / 'packaging/Dockerfile').read_text()
     (volume,) = re.findall(r'-v fogros2:(\S+)', (ROOT / 'doc/install.md').read_text())
