@@ -62,6 +62,15 @@ if [ -d install ] &&
 fi
 """
 
+# Make a folder for an account, in which that account may enter: $1 is its path, $2 user:group.
+_AS_ROOT = """\
+[ ! -e "$1" ] || { echo "$1 belongs to $(stat -c %U "$1"): use another login user, or a" \
+    "workspace at another path" >&2; exit 1; }
+umask 022
+mkdir -p "$1"
+chown "$2" "$1"
+"""
+
 
 @dataclasses.dataclass(frozen=True)
 class Workspace:
@@ -332,12 +341,8 @@ def transfer(
     :returns: what was done, in a few words.
     """
     linked = dict.fromkeys(folder for way in ways for folder in way.linked)
-    for target in map(shlex.quote, (*(way.target for way in ways), *map(str, linked))):
-        # The login user may have no right to create the path of the robot's workspace.
-        shell.run(Command.script(
-            f'[ -w {target} ] || mkdir -p {target} 2>/dev/null || '
-            f'{{ sudo -n mkdir -p {target} && sudo -n chown "$(id -u):$(id -g)" {target}; }}',
-            what='make a folder for the workspace'), timeout=timeouts.command, cancel=cancel)
+    for target in sorted((*(way.target for way in ways), *map(str, linked))):
+        shell.run(make_folder(target), timeout=timeouts.command, cancel=cancel)
     sync = functools.partial(
         shell.sync, timeout=timeouts.sync, cancel=cancel, on_progress=on_progress)
     reports = [retried(functools.partial(
@@ -353,6 +358,15 @@ def transfer(
             f'{size(sum(report.bytes for report in reports))}')
     return ', '.join([sent, *(
         f'built there: {way.reason}' for way in ways if way.commands)])
+
+
+def make_folder(target: str) -> Command:
+    """Return the command that makes a folder, as root where the login user may not."""
+    path = shlex.quote(target)
+    return Command.script(
+        f'[ -w {path} ] || mkdir -p {path} 2>/dev/null || '
+        f'sudo -n sh -ec {shlex.quote(_AS_ROOT)} sh {path} "$(id -u):$(id -g)"',
+        what='make a folder for the workspace')
 
 
 def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> str:

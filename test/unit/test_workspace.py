@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 import shutil
 import subprocess
+import tempfile
 from typing import Any
 
 import pytest
@@ -503,3 +504,20 @@ def test_underlays_are_sent_first_each_to_its_own_path(chain: list[Path], tmp_pa
     for root in chain:
         assert Path(f'{folder}{root}/install/local_setup.sh').is_file()
         assert not Path(f'{folder}{root}/src').exists()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root can act as another user')
+def test_folder_that_root_makes_opens_and_none_is_taken_over() -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        os.chown(folder, 65534, 65534)
+        write(folder / 'bin/mkdir', '#!/bin/sh\nexit 1\n', 0o755)
+        write(folder / 'bin/sudo', '#!/bin/sh\nshift\nPATH=/usr/bin:/bin exec "$@"\n', 0o755)
+        (folder / 'theirs').mkdir()
+        results = [subprocess.run(
+            workspace.make_folder(f'{name}/{target}').argv, user=65534, group=65534, umask=0o027,
+            env={'PATH': f'{name}/bin:/usr/bin:/bin'}, capture_output=True, text=True)
+            for target in ('new/workspace', 'theirs')]
+        assert (folder / 'new').stat().st_mode & 0o777 == 0o755
+    assert results[0].returncode == 0
+    assert results[1].returncode == 1 and 'theirs belongs to root' in results[1].stderr
