@@ -85,9 +85,11 @@ class WireGuard(Vpn):
         return Command.script(
             f'umask 077; set -C\n'
             f'if [ ! -s {key} ]; then\n'
-            f'  mkdir -p {folder}; wg genkey >{key}.$$ || :\n'
-            f'  [ -s {key}.$$ ] || {{ rm -f {key}.$$\n'
-            f'    echo {key}" can\'t be written: is the disk full?" >&2; exit 1; }}\n'
+            f'  mkdir -p {folder} && wg genkey >{key}.$$ || :\n'
+            f'  [ -s {key}.$$ ] || {{ rm -f {key}.$$ || :\n'
+            f'    reason="is the disk full?"; [ -w {folder} ] || reason="root may not write there,'
+            ' so name a folder of a local disk in FOGROS2_STATE_HOME"\n'
+            f'    echo {key}" can\'t be written: $reason" >&2; exit 1; }}\n'
             f'  mv -f {key}.$$ {key}\n'
             f'fi\n'
             f'wg pubkey <{key}',
@@ -178,12 +180,14 @@ class WireGuard(Vpn):
     def down(self, interface: VpnInterface) -> Iterator[Command]:
         """Yield one script that undoes ``up`` in reverse order, and continues after errors."""
         undos = [step.undo for step in reversed(self._steps(interface, ())) if step.undo]
-        files = f'{shlex.quote(interface.key_file)} {_noted(interface)}'
+        key, files = shlex.quote(interface.key_file), _noted(interface)
         if not interface.firewall:
             undos.insert(0, f'[ ! -e {more(interface)} ] || {_more(interface, "clear")}')
             files += f' {more(interface)} {more(interface)}.* /run/{_name(interface)}.watch*'
         lines = [_PATH, 'failed=0', *(f'{{ {undo}\n}} || failed=1' for undo in undos)]
-        lines += [f'rm -f {files} || failed=1', 'exit $failed']
+        # root may be unable to enter the key's folder, and then has made no key
+        lines += [f'[ ! -e {key} ] || rm -f {key} || failed=1',
+                  f'rm -f {files} || failed=1', 'exit $failed']
         yield Command.script('\n'.join(lines), sudo=True, what=_what('take', interface, 'down'))
 
     def leave(self, interface: VpnInterface) -> Iterator[Command]:

@@ -7,6 +7,7 @@ import dataclasses
 import os
 from pathlib import Path
 import subprocess
+import tempfile
 
 import pytest
 
@@ -65,6 +66,22 @@ def test_full_disk_is_the_reason_that_the_key_is_not_written(tmp_path: Path) -> 
         **os.environ, 'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
     assert done.returncode != 0 and not [*key.parent.iterdir()]
     assert done.stderr.strip() == f"{key} can't be written: is the disk full?"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root can act as another user')
+def test_folder_that_root_may_not_enter_has_a_remedy_and_no_key(tmp_path: Path) -> None:
+    """Such as a home on NFS; here, another user takes the part of root."""
+    interface = dataclasses.replace(ROBOT, key_file=str(tmp_path / 'launch/vpn.key'))
+    tmp_path.chmod(0o700)
+    with tempfile.TemporaryDirectory() as name:
+        (Path(name) / 'nft').symlink_to('/bin/true')
+        Path(name).chmod(0o755)
+        keys, down = (subprocess.run(
+            command.argv, user=65534, capture_output=True, text=True,
+            env={'PATH': f'{name}:/usr/bin:/bin'})
+            for command in (WireGuard().keys(interface), *WireGuard().down(interface)))
+    assert keys.returncode == 1 and 'FOGROS2_STATE_HOME' in keys.stderr.splitlines()[-1]
+    assert (down.returncode, down.stderr) == (0, '')
 
 
 def test_filter_exists_before_and_after_the_interface() -> None:
