@@ -67,6 +67,11 @@ def cache_home() -> Path:
     return check_owner(Path(base) / 'fogros2')
 
 
+def _config_home() -> Path:
+    base = os.environ.get('XDG_CONFIG_HOME') or os.path.expanduser('~/.config')
+    return Path(base) / 'fogros2'
+
+
 def check_owner(path: Path) -> Path:
     """
     Check that a path, if it exists, belongs to root, this account, or its folder's owner.
@@ -241,7 +246,7 @@ class Store:
 
     def launch_folder(self, launch_id: str) -> Path:
         """Return a launch's folder (0700); create it if needed."""
-        return _make_folder(self.root / 'launches' / launch_id)
+        return make_folder(self.root / 'launches' / launch_id)
 
     def machine(self, name: str) -> Path:
         """Return the path of a machine's folder, whether or not it exists."""
@@ -319,7 +324,7 @@ class Store:
         """
         # beside the folder: deleting the folder must not release the lock early
         path = self.machine(name).with_name(f'.{name}.lock')
-        _make_folder(path.parent)
+        make_folder(path.parent)
         with contextlib.ExitStack() as undo:
             while True:
                 try:
@@ -403,8 +408,7 @@ def robot_id(*, new: bool = True) -> str:
     :param new: make digits if there are none; else return the name alone.
     :raises StoreError: the file can't be written.
     """
-    base = os.environ.get('XDG_CONFIG_HOME') or os.path.expanduser('~/.config')
-    folders = (Path(base) / 'fogros2', state_home())
+    folders = (_config_home(), state_home())
     error: Optional[OSError] = None
     for make in (False, True) if new else (False,):
         for folder in folders:
@@ -439,7 +443,7 @@ def _digits(folder: Path, *, new: bool) -> str:
     :param new: make digits if there are none of this computer.
     """
     if new:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _make_folders(folder)
     machine = Path('/etc/machine-id')
     machine_id = machine.read_text().strip() if machine.exists() else ''
     addresses = mac_addresses()
@@ -485,7 +489,7 @@ def write_private(path: Path, data: bytes) -> None:
 
     :raises StoreError: the disk is full, or the folder is not writable.
     """
-    _make_folder(path.parent)
+    make_folder(path.parent)
     try:
         handle, aside = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.{os.getpid()}.')
         try:
@@ -541,7 +545,7 @@ def process_folder() -> Path:
 
     :raises StoreError: the disk is full, or the state folder is not writable.
     """
-    home = _make_folder(state_home())
+    home = make_folder(state_home())
     try:
         folder = tempfile.mkdtemp(dir=home, prefix=f'.process.{os.getpid()}.')
     except OSError as error:
@@ -563,18 +567,34 @@ def _check_readable(root: Path) -> None:
                 folder, os.X_OK | (os.R_OK if inside else 0), effective_ids=True):
             raise StoreError(
                 f"{folder} can't be read by this user",
-                f'sudo chown -R {os.geteuid()} {root}' if inside else _ELSEWHERE)
+                f'sudo chown -R {os.geteuid()} {root if inside else folder}'
+                if inside or folder.is_relative_to(os.path.expanduser('~/.local'))
+                else _ELSEWHERE)
 
 
-def _make_folder(path: Path) -> Path:
+def make_folder(path: Path) -> Path:
+    """
+    Create a folder (0700) and the folders above it, if needed; return it.
+
+    :raises StoreError: the disk is full, or the folder above is not writable.
+    """
     try:
-        # parents=True would create the parent folders with the default mode
-        for folder in reversed([path, *path.parents]):
-            if not folder.exists():
-                folder.mkdir(mode=0o700, exist_ok=True)
+        _make_folders(path)
     except OSError as error:
         raise _not_written(path, error) from error
     return path
+
+
+def _make_folders(path: Path) -> None:
+    # parents=True would create the parent folders with the default mode
+    for folder in reversed([path, *path.parents]):
+        if not folder.exists():
+            folder.mkdir(mode=0o700, exist_ok=True)
+            if os.geteuid() == 0 and any(folder in home.parents for home in (
+                    state_home(), cache_home(), _config_home())):
+                # such as ~/.local of a user who runs a launch by sudo
+                owner = folder.parent.stat()
+                os.chown(folder, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
 
 def _not_written(path: Path, error: OSError) -> StoreError:

@@ -9,6 +9,7 @@ import re
 import stat
 import subprocess
 import sys
+import tempfile
 import threading
 
 import pytest
@@ -210,6 +211,33 @@ def test_a_state_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(StoreError, match='FOGROS2_STATE_HOME'):
         Store(tmp_path / 'file').save(record())
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root can give a folder to another account')
+def test_launch_by_sudo_leaves_the_users_folders_to_the_user(monkeypatch, tmp_path):
+    for name in ('XDG_STATE_HOME', 'XDG_CONFIG_HOME', 'FOGROS2_STATE_HOME'):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv('HOME', str(tmp_path))
+    os.chown(tmp_path, 65534, 65534)
+    Store().launch_folder('x')
+    robot_id()
+    assert {path.name for path in tmp_path.rglob('*') if path.stat().st_uid == 0} == {
+        'fogros2', 'launches', 'x', 'robot.json'}
+    assert all(path.stat().st_gid == 65534 for path in (tmp_path / '.local', tmp_path / '.config'))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='takes root, to become another user')
+def test_closed_folder_of_the_users_home_is_the_one_to_give_back(monkeypatch):
+    with tempfile.TemporaryDirectory() as home:
+        Path(home).chmod(0o755)
+        (Path(home) / '.local').mkdir(mode=0o700)
+        monkeypatch.setenv('HOME', home)
+        os.seteuid(65534)
+        try:
+            with pytest.raises(StoreError, match=rf'sudo chown -R 65534 {home}/.local\)'):
+                Store(Path(home) / '.local/state/fogros2')
+        finally:
+            os.seteuid(0)
 
 
 def test_robot_that_cannot_write_has_a_name_to_read_with(monkeypatch):
