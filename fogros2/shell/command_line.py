@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shlex
 
 from fogros2.errors import CommandError
@@ -46,10 +47,11 @@ def marked_line(line: str) -> str:
     Return a line that prints a mark before the output of its command, in the user's home.
 
     The login shell may have printed something before, and have changed its folder; with a trap of
-    bash it prints each of its commands.
+    bash it prints each of its commands. csh and fish read quotes and lines in another way than sh.
     """
     script = f"cd; echo {MARK.decode().strip()}; exec {line.removeprefix('exec ')}"
-    return f'exec sh -c {shlex.quote(script)}'
+    encoded = re.sub(r'[\\\'"$`!\n]', lambda found: f'\\0{ord(found[0]):03o}', script)
+    return f"""exec sh -c 'eval "$(printf %b "{encoded}")"'"""
 
 
 def end_script(pid: int) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -37,6 +38,17 @@ def test_an_announced_line_prints_its_process_first():
     child = subprocess.run(['sh', '-c', line], capture_output=True, text=True, check=True)
     first, second = child.stdout.splitlines()
     assert second == f'{first} a b'
+
+
+@pytest.mark.parametrize('login', filter(shutil.which, ['sh', 'bash', 'tcsh', 'fish']))
+def test_any_login_shell_takes_scripts_of_several_lines(login):
+    script = "read -r a\nprintf '%s!x\\\\%s\\n' $a \"$HOME's\"\n"
+    line = command_line.marked_line(
+        command_line.announced_line(Command.script(script), user='u'))
+    assert '\n' not in line and '!' not in line
+    child = subprocess.run([login, '-c', line], input='in\n', capture_output=True, text=True,
+                           check=True)
+    assert child.stdout.splitlines()[-1] == f"in!x\\{os.environ['HOME']}'s"
 
 
 def test_the_end_script_ends_a_group():
