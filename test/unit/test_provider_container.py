@@ -21,6 +21,7 @@ from fogros2.errors import (
     CommandError,
     ConfigurationError,
     MachineNotFound,
+    NameTaken,
     PrerequisiteError,
     ProviderError,
 )
@@ -480,6 +481,25 @@ def test_downloads_by_sudo_get_the_users_proxies(monkeypatch, tmp_path, options)
         'env', 'HTTPS_PROXY=http://proxy:3128', 'no_proxy=localhost',
         'podman' if 'image' in options else 'unshare')]
     assert downloads[0].sudo
+
+
+@pytest.mark.parametrize(('owner', 'words', 'remedy'), [
+    ('bob-1001', "'m' of the robot bob-1001 already", 'another name='),
+    ('me-1000', "'m' already", 'another name=, or: ros2 fog delete m')])
+def test_machine_of_another_robot_is_not_the_one_to_delete(monkeypatch, owner, words, remedy):
+    def run(command, **more):
+        if 'create' in command.argv:
+            raise CommandError(command, Result(125, '', 'the name is in use'), 'here')
+        return Result(0, json.dumps([{'Config': {'Labels': {
+            container_machine.ATTEMPT: 'theirs', 'fogros2-robot': owner}}}]), '')
+
+    monkeypatch.setattr(container_engine.process, 'run', run)
+    monkeypatch.setattr(container_engine, 'select', lambda *_: container_engine.named('docker'))
+    request = dataclasses.replace(REQUEST, tags={'fogros2-robot': 'me-1000'})
+    with pytest.raises(NameTaken) as taken:
+        container.ContainerProvider().create(
+            MachineSpec('m', 'container', {'image': 'any'}), request)
+    assert words in taken.value.args[0] and taken.value.hint.endswith(remedy)
 
 
 def test_docker_machine_gets_its_packet_filter_at_once(monkeypatch):

@@ -255,9 +255,14 @@ class ContainerProvider(Provider):
         reports = engine.inspect([container_machine.container_name(name, request.tags)])
         if not reports:
             raise error
-        if container_machine.labels_of(reports[0]).get(container_machine.ATTEMPT) != request.token:
-            raise NameTaken(f"there is a container machine '{name}' already",
-                            f'ros2 fog delete {name}') from error
+        labels = container_machine.labels_of(reports[0])
+        if labels.get(container_machine.ATTEMPT) != request.token:
+            owner = labels.get(TAG_ROBOT)
+            own = owner == request.tags.get(TAG_ROBOT)
+            raise NameTaken(
+                f"there is a container machine '{name}'{'' if own else f' of the robot {owner}'} "
+                'already', 'give the machine another name='
+                + (f', or: ros2 fog delete {name}' if own else '')) from error
         return str(reports[0]['Id'])
 
     def _create_from_root(
