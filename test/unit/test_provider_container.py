@@ -485,13 +485,14 @@ def test_downloads_by_sudo_get_the_users_proxies(monkeypatch, tmp_path, options)
 
 @pytest.mark.parametrize(('owner', 'words', 'remedy'), [
     ('bob-1001', "'m' of the robot bob-1001 already", 'another name='),
+    (None, "'m' already", 'another name='),
     ('me-1000', "'m' already", 'another name=, or: ros2 fog delete m')])
 def test_machine_of_another_robot_is_not_the_one_to_delete(monkeypatch, owner, words, remedy):
     def run(command, **more):
         if 'create' in command.argv:
             raise CommandError(command, Result(125, '', 'the name is in use'), 'here')
-        return Result(0, json.dumps([{'Config': {'Labels': {
-            container_machine.ATTEMPT: 'theirs', 'fogros2-robot': owner}}}]), '')
+        labels = {container_machine.ATTEMPT: 'theirs', 'fogros2-robot': owner}
+        return Result(0, json.dumps([{'Config': {'Labels': labels}}]), '')
 
     monkeypatch.setattr(container_engine.process, 'run', run)
     monkeypatch.setattr(container_engine, 'select', lambda *_: container_engine.named('docker'))
@@ -500,6 +501,16 @@ def test_machine_of_another_robot_is_not_the_one_to_delete(monkeypatch, owner, w
         container.ContainerProvider().create(
             MachineSpec('m', 'container', {'image': 'any'}), request)
     assert words in taken.value.args[0] and taken.value.hint.endswith(remedy)
+
+
+@pytest.mark.parametrize('script', ['_CREATE', '_SHARE'])
+def test_folder_that_root_cannot_make_has_a_reason(tmp_path, script):
+    (tmp_path / 'disk').touch()
+    done = subprocess.run(
+        ['sh', '-ec', getattr(container, script), 'sh', f'{tmp_path}/disk/fogros2/top', *'biencs'],
+        capture_output=True, text=True, timeout=60)
+    assert done.returncode not in (0, container._TOKEN_USED)
+    assert 'Not a directory' in done.stderr.splitlines()[-1]
 
 
 def test_docker_machine_gets_its_packet_filter_at_once(monkeypatch):

@@ -77,10 +77,11 @@ failed() {
     exit $code
 }
 tries=0
-until install -d -m 700 "${top%/*}" && mkdir -m 700 "$top" 2>/dev/null; do
-    # it exists: another attempt with this token, or one that was interrupted
-    [ -e "$top" ] || [ $tries -gt 9 ] && exit 17  # _TOKEN_USED
-    tries=$((tries + 1))
+# the end of the last machine may remove the outer folder
+until reason=$({ install -d -m 700 "${top%/*}" && mkdir -m 700 "$top"; } 2>&1); do
+    # another attempt with this token, or one that was interrupted
+    [ ! -e "$top" ] || exit 17  # _TOKEN_USED
+    [ $((tries += 1)) -lt 10 ] || { echo "$reason" >&2; exit 1; }
 done
 trap failed EXIT
 # dash runs no EXIT trap for a signal, and a signal interrupts 'wait' alone
@@ -126,7 +127,10 @@ _SHARE = """\
 umask 077
 top=$1
 shift
-until mkdir -p "$top/own" && chmod 1777 "$top/own" && chmod 755 "$top" "${top%/*}"; do
+tries=0
+until reason=$({ mkdir -p "$top/own" && chmod 1777 "$top/own" &&
+        chmod 755 "$top" "${top%/*}"; } 2>&1); do
+    [ $((tries += 1)) -lt 10 ] || { echo "$reason" >&2; exit 1; }
     sleep 0.1
 done
 umask 022
@@ -259,9 +263,10 @@ class ContainerProvider(Provider):
         if labels.get(container_machine.ATTEMPT) != request.token:
             owner = labels.get(TAG_ROBOT)
             own = owner == request.tags.get(TAG_ROBOT)
+            whose = f' of the robot {owner}' if owner and not own else ''
             raise NameTaken(
-                f"there is a container machine '{name}'{'' if own else f' of the robot {owner}'} "
-                'already', 'give the machine another name='
+                f"there is a container machine '{name}'{whose} already",
+                'give the machine another name='
                 + (f', or: ros2 fog delete {name}' if own else '')) from error
         return str(reports[0]['Id'])
 
@@ -569,8 +574,8 @@ def _sharing(request: CreateRequest) -> Iterator[None]:
         if request.common:
             failed.callback(process.run, Command(('sh', '-c', _UNSHARE, 'sh', folder), sudo=True),
                             timeout=10.0, check=False)
-            process.run(Command(('sh', '-ec', _SHARE, 'sh', folder, *request.common), sudo=True),
-                        timeout=10.0)
+            process.run(Command(('sh', '-ec', _SHARE, 'sh', folder, *request.common), sudo=True,
+                                what='make the folder of shared topics'), timeout=10.0)
         yield
         failed.pop_all()
 
