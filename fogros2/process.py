@@ -23,7 +23,7 @@ from fogros2.waiting import noted
 
 HERE = 'this computer'
 #: sudo's reason for refusing without a password, and the remedy.
-PASSWORD = 'sudo wants a password', 'run `sudo -v` first'
+PASSWORD = 'sudo wants a password', 'run `sudo -v` first, or allow it without a password'
 #: The same for a user without rights.
 NO_RIGHTS = ('this user may not use sudo',
              "ask the computer's administrator, or let a user who may launch it")
@@ -125,7 +125,9 @@ def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
         return PASSWORD
     if 'may not run sudo' in text or 'not in the sudoers' in text or 'not allowed' in text:
         return NO_RIGHTS
-    reason = (text.strip().splitlines() or ['it says nothing'])[-1].removeprefix('sudo: ')
+    # advice may follow the reason
+    reasons = [line for line in text.strip().splitlines() if 'unable to resolve host' not in line]
+    reason = (reasons or ['it says nothing'])[0].removeprefix('sudo: ')
     return f"sudo doesn't work here: {reason}", 'run it as root'
 
 
@@ -224,7 +226,7 @@ def run(
     if check and result.returncode != 0:
         hint = ''
         if command.sudo and 'password is required' in result.stderr:
-            hint = 'run `sudo -v` first, or allow it without a password'
+            hint = PASSWORD[1]
         raise CommandError(command, result, HERE, hint)
     return result
 

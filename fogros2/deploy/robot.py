@@ -76,9 +76,10 @@ def check_sudo(*, ask: bool = False) -> None:
         trouble = process.sudo_trouble()
     if trouble is not None:
         reason, remedy = trouble
-        if Path(helped.HELPER).exists():
-            remedy += f', or have an administrator put you into the group {helped.GROUP}'
-        raise PrerequisiteError(f'a VPN interface needs root, and {reason}', remedy)
+        helper = f'put you into the group {helped.GROUP}' if Path(helped.HELPER).exists() \
+            else 'install the helper (doc/install.md)'
+        raise PrerequisiteError(f'a VPN interface needs root, and {reason}',
+                                f'{remedy}, or have an administrator {helper}')
 
 
 def clear(folder: Path) -> None:

@@ -92,12 +92,14 @@ def test_a_program_that_cannot_be_started_is_one_clear_error(monkeypatch):
 
 @pytest.mark.parametrize(('said', 'reason', 'hint'), [
     (['sudo: a password is required', 'sudo: a password is required'],
-     'sudo wants a password', '`sudo -v`'),
+     'sudo wants a password', 'run `sudo -v` first, or allow it without a password'),
     (['sudo: a password is required', 'Sorry, user eve may not run sudo on robot.'],
      'this user may not use sudo', 'administrator'),
     (['eve is not in the sudoers file.'], 'this user may not use sudo', 'administrator'),
-    (['sudo: The "no new privileges" flag is set, which prevents sudo from running as root.'],
-     "sudo doesn't work here: The", 'as root'),
+    (['sudo: unable to resolve host robot: Name or service not known\n'
+      'sudo: The "no new privileges" flag is set, which prevents sudo from running as root.\n'
+      'sudo: If sudo is running in a container, you may need to adjust the container '
+      'configuration to disable the flag.\n'], "sudo doesn't work here: The", 'as root'),
     ([''], 'it says nothing', 'as root')])
 def test_failure_of_sudo_has_its_reason(monkeypatch, said, reason, hint):
     answers = list(said)

@@ -360,7 +360,7 @@ def test_user_outside_of_the_group_is_refused(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(process, 'sudo_trouble', lambda: process.PASSWORD)
     with pytest.raises(PrerequisiteError) as caught:
         robot.check_sudo()
-    assert caught.value.hint == process.PASSWORD[1]
+    assert 'install the helper' in caught.value.hint
     monkeypatch.setattr(helped, 'HELPER', sys.executable)
     with pytest.raises(PrerequisiteError) as caught:
         robot.check_sudo()

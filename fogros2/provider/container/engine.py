@@ -102,7 +102,7 @@ def stopped(text: str) -> bool:
 def sudo_hint(text: str) -> str:
     """Return the remedy if sudo refused, or ''."""
     if 'password is required' in text or 'a terminal is required' in text:
-        return 'run `sudo -v` first, or allow it without a password'
+        return process.PASSWORD[1]
     return ''
 
 
