@@ -306,6 +306,14 @@ def test_programs_are_missed_before_sudo_asks(monkeypatch, tmp_path, options, mi
         provider.check_here(spec)
 
 
+def test_member_of_dockers_group_needs_sudo_for_the_filter(monkeypatch):
+    monkeypatch.setattr(container_engine, 'select', lambda *_: Engine('docker', sudo=False))
+    monkeypatch.setattr(container.ContainerProvider, 'check_here', lambda *_: None)
+    monkeypatch.setattr(container.process, 'sudo_trouble', lambda: container.process.NO_RIGHTS)
+    with pytest.raises(PrerequisiteError, match='needs root on this computer, and this user may'):
+        container.ContainerProvider().check(MachineSpec('m', 'container', {'image': 'any'}))
+
+
 def test_control_groups_decide_podman_s_flags():
     flags = container_engine.flags_for
     assert flags(unified=True, systemd=True, runc=True) == ()

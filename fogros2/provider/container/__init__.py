@@ -193,10 +193,10 @@ class ContainerProvider(Provider):
         self.check_here(spec)
         options = Options.parse(spec.options)
         engine = container_engine.select(options.engine, options.image)
-        trouble = process.sudo_trouble() if engine.sudo else None
+        trouble = process.sudo_trouble()  # the packet filter needs it with docker's group, too
         if trouble is not None:
             raise PrerequisiteError(
-                f'{engine.name} needs root on this computer, and {trouble[0]}', trouble[1])
+                f'a container machine needs root on this computer, and {trouble[0]}', trouble[1])
         container_engine.answers(engine)
         if options.image:
             container_engine.check_architecture(engine, options.image)
