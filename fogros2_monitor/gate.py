@@ -290,6 +290,8 @@ async def _run(options: argparse.Namespace) -> None:
     if options.public:
         serving.append(asyncio.ensure_future(
             gate.serve(_listen(options.public), _public_port(options))))
+    if options.ready is not None:
+        os.write(options.ready, b'\n')
     await asyncio.wait({ended, *serving}, return_when=asyncio.FIRST_COMPLETED)
     for task in serving:
         if task.done():
@@ -328,6 +330,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> None:
     parser.add_argument('--key', help='PEM file')
     parser.add_argument('--token-file', required=True,
                         help='file with the token, so that no process list has it')
+    parser.add_argument('--ready', type=int,
+                        help='file descriptor that gets a byte when the gate listens')
     parser.add_argument('--application', type=endpoint, help='where the web application listens')
     parser.add_argument('--name', default=socket.gethostname(), help="the machine's, for people")
     options = parser.parse_args(arguments)

@@ -88,18 +88,20 @@ def main() -> None:
     end, kept = os.pipe()
     ended, alive = os.pipe()  # the gate keeps the second end open, and the bridge reads
     os.set_inheritable(kept, True)  # the bridge keeps this end open; at its end the others exit
+    application = []
     if ours.image and ours.vpn is not None:
         inside = application_port(ours.vpn)
-        gate += ['--application', f'{_LOOPBACK}:{inside}']
-        subprocess.Popen(
-            [sys.executable, '-m', 'fogros2_monitor.application', '--image', ours.image,
-             '--port', str(inside),
-             '--name', ours.name], stdin=end)
+        gate += ['--application', f'{_LOOPBACK}:{inside}', '--ready', str(alive)]
+        application = ['--image', ours.image, '--port', str(inside), '--name', ours.name]
     subprocess.Popen(
         [sys.executable, '-m', 'fogros2_monitor.gate', '--to', f'{address}:{port}',
          '--until-eof', *gate], stdin=end, pass_fds=[alive])
-    os.close(end)
     os.close(alive)
+    # where the gate of another launch has the port, that launch's application stays
+    if application and os.read(ended, 1):
+        subprocess.Popen([sys.executable, '-m', 'fogros2_monitor.application', *application],
+                         stdin=end)
+    os.close(end)
     os.set_inheritable(ended, True)
     os.execv(sys.executable, [
         sys.executable, '-m', 'fogros2_monitor.bridge', '--ros-args', *words[at + 1:],

@@ -10,6 +10,7 @@ import sys
 
 import pytest
 
+from fogros2.waiting import wait_until
 from rigs.domains import taken
 
 serve = pytest.importorskip(
@@ -21,6 +22,26 @@ def test_unwritable_token_folder_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, 'argv', ['bridge', '--secrets', f'{tmp_path}/file/secrets'])
     with pytest.raises(SystemExit, match='its token to .*\n--secrets names another folder'):
         serve.main()
+
+
+def test_application_starts_only_once_the_gate_listens(tmp_path):
+    """Else the bridge of another launch, at whose port this one fails, would lose its own."""
+    podman = tmp_path / 'podman'
+    podman.write_text(f'#!/bin/sh\necho >>{tmp_path}/called\nexit 1\n')
+    podman.chmod(0o755)
+    with socket.create_server(('127.0.0.1', 0)) as other, taken() as domain:
+        port = other.getsockname()[1]
+        words = [sys.executable, '-m', 'fogros2_monitor.serve', '--image', 'x', '--secrets',
+                 str(tmp_path), '--listen', f'127.0.0.1:{port}', '--vpn', str(port)]
+        options = {'stderr': subprocess.DEVNULL, 'stdout': subprocess.DEVNULL, 'env': {
+            **os.environ, 'ROS_DOMAIN_ID': domain, 'FOGROS2_VPN_ADDRESS': '127.0.0.2',
+            'PATH': f'{tmp_path}:{os.environ["PATH"]}'}}
+        subprocess.run(words, timeout=60, **options)
+        assert not (tmp_path / 'called').exists()
+        other.close()
+        with subprocess.Popen(words, **options) as bridge:
+            wait_until((tmp_path / 'called').exists, timeout=60, what='the application')
+            bridge.terminate()
 
 
 def test_taken_port_is_named_and_ends_the_bridge(tmp_path):
