@@ -105,7 +105,7 @@ def _collect(folder: Path) -> Wheels:
     target = folder / key
     if not (target / 'wheels.json').exists():
         # Two launches may pack at the same time, so move the complete folder.
-        folder.mkdir(parents=True, exist_ok=True)
+        store.make_folder(folder)
         with tempfile.TemporaryDirectory(dir=folder, prefix='.new-') as aside:
             packed = {name: _wheel(d, Path(aside)) for name, d in zip(names, distributions)}
             digests = hashes(Path(aside))
@@ -150,8 +150,7 @@ def fetch(
     """
     lines = locked.requirements(names, python)
     key = hashlib.sha256(json.dumps([python, lines]).encode()).hexdigest()[:16]
-    target = (folder or cache_folder()) / f'fetched-{key}'
-    target.mkdir(parents=True, exist_ok=True)
+    target = store.make_folder((folder or cache_folder()) / f'fetched-{key}')
     source = os.environ.get('FOGROS2_WHEELS', '')
     version = '{}{}'.format(*python)
     with tempfile.NamedTemporaryFile('w', suffix='.txt') as file:

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import dataclasses
 from importlib import metadata
+import os
 from pathlib import Path
+import stat
 import sys
 import threading
 import zipfile
@@ -94,6 +96,16 @@ def test_another_content_is_another_wheel(colcon, tmp_path, monkeypatch):
     (module,) = colcon.glob('lib/*/site-packages/fogros2/clock.py')
     module.write_text('x = 2\n')
     assert wheels.collect(tmp_path / 'cache').key != first.key
+
+
+def test_cache_is_the_users_alone_with_any_umask(colcon, tmp_path):
+    before = os.umask(0)
+    try:
+        packed = wheels.collect(tmp_path / 'fogros2/wheels')
+    finally:
+        os.umask(before)
+    for folder in (tmp_path / 'fogros2', tmp_path / 'fogros2/wheels', Path(packed.folder)):
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
 def test_development_install_is_refused_with_a_remedy(colcon, tmp_path):

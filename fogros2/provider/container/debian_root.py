@@ -153,7 +153,7 @@ def root(
     if target.is_dir():
         return target
     # its programs with root's rights may be older than this computer's: no other account runs them
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    store.make_folder(folder)
     folder.chmod(0o700)
     with open(folder / 'lock', 'w') as lock:
         wait_until(lambda: _lock(lock), timeout=TIMEOUT, cancel=cancel, longest=0.5,
