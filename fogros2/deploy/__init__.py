@@ -21,9 +21,18 @@ Each step pushes its undo before it runs. The modules, each imports only those b
 """
 
 from fogros2.deploy.launch import Launch
-from fogros2.deploy.robot import check_robot, check_sudo, provider, ROBOT_PROGRAMS
+from fogros2.deploy.robot import (
+    check_robot,
+    check_sudo,
+    kernel_wireguard,
+    provider,
+    ROBOT_PROGRAMS,
+    TUN,
+    TUN_REMEDY,
+)
 from fogros2.deploy.running import RunningMachine
 
 __all__ = [
-    'check_robot', 'check_sudo', 'Launch', 'provider', 'ROBOT_PROGRAMS', 'RunningMachine',
+    'check_robot', 'check_sudo', 'kernel_wireguard', 'Launch', 'provider', 'ROBOT_PROGRAMS',
+    'RunningMachine', 'TUN', 'TUN_REMEDY',
 ]

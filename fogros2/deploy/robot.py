@@ -20,6 +20,9 @@ from fogros2.waiting import Timeouts
 #: Programs that the robot's side calls, and the Debian packages that contain them.
 ROBOT_PROGRAMS = {program: process.PACKAGES.get(program, program)
                   for program in ('ip', 'wg', 'nft', 'rsync', 'ssh-keygen')}
+#: The device of ``wireguard-go`` and of container machines, and the remedy where it is missing.
+TUN = Path('/dev/net/tun')
+TUN_REMEDY = f'sudo modprobe tun; in a container: start it with --device {TUN}'
 
 #: Held while sudo may ask for a password, so that only one thread asks.
 _ASKING = threading.Lock()
@@ -52,11 +55,18 @@ def check_robot() -> None:
     :raises PrerequisiteError: a program, a right or a device is missing.
     """
     process.require(list(ROBOT_PROGRAMS), package_of=ROBOT_PROGRAMS)
-    if not Path('/dev/net/tun').exists():
-        raise PrerequisiteError('/dev/net/tun is missing on this computer', 'sudo modprobe tun')
+    if not TUN.exists() and not kernel_wireguard():
+        raise PrerequisiteError(f'{TUN} is missing on this computer', TUN_REMEDY)
     if os.geteuid() != 0 and not helped.permitted():
         with _ASKING:
             check_sudo(ask=True)
+
+
+def kernel_wireguard() -> bool:
+    """Return whether the kernel has WireGuard's module, so that an interface needs no TUN."""
+    return Path('/sys/module/wireguard').exists() or process.which('modprobe') is not None \
+        and process.run(Command(('modprobe', '-nq', 'wireguard')), timeout=10.0,
+                        check=False).returncode == 0
 
 
 def check_sudo(*, ask: bool = False) -> None:

@@ -166,24 +166,22 @@ def root() -> Check:
 
 def tun() -> Check:
     """Check for the TUN device."""
-    if Path('/dev/net/tun').exists():
-        return Check('TUN', 'ok', '/dev/net/tun')
-    return Check('TUN', 'failed', 'no /dev/net/tun', 'sudo modprobe tun')
+    if deploy.TUN.exists():
+        return Check('TUN', 'ok', str(deploy.TUN))
+    if deploy.kernel_wireguard():
+        return Check('TUN', 'warning', f'no {deploy.TUN}, which container machines need',
+                     deploy.TUN_REMEDY)
+    return Check('TUN', 'failed', f'no {deploy.TUN}', deploy.TUN_REMEDY)
 
 
 def wireguard() -> Check:
     """Check for WireGuard in the kernel, or as a program."""
-    if _kernel_wireguard():
+    if deploy.kernel_wireguard():
         return Check('WireGuard', 'ok', 'in the kernel')
     if process.which('wireguard-go'):
         return Check('WireGuard', 'ok', 'wireguard-go (the kernel has no module)')
     return Check('WireGuard', 'failed', 'neither in the kernel nor as wireguard-go',
                  'sudo apt-get install wireguard-go')
-
-
-def _kernel_wireguard() -> bool:
-    """Return whether the kernel has WireGuard's module."""
-    return Path('/sys/module/wireguard').exists() or _succeeds('modprobe', '-nq', 'wireguard')
 
 
 def engine() -> Check:
@@ -286,7 +284,7 @@ def machine_defaults() -> Check:
 def receive_buffer(settings: Path = Path('/proc/sys/net/core')) -> Check:
     """Check the kernel's settings of receive buffers; raw images need large ones."""
     name, wanted = 'receive buffer', {'rmem_max': cyclonedds.RECEIVE_BUFFER}
-    if not _kernel_wireguard():
+    if not deploy.kernel_wireguard():
         # releases of wireguard-go before 2023 request no size, and get the default
         wanted = dict.fromkeys(('rmem_default', 'rmem_max'), WIREGUARD_BUFFER)
     try:
@@ -414,13 +412,6 @@ def lan_peers(seconds: float) -> Check:
             f"ROS_AUTOMATIC_DISCOVERY_RANGE is {os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']}",
             'unset ROS_AUTOMATIC_DISCOVERY_RANGE if they should')
     return Check(name, 'ok', f"participants at {hosts}; a launch's nodes here talk to them")
-
-
-def _succeeds(*words: str) -> bool:
-    try:
-        return process.run(Command(words), timeout=10.0, check=False).returncode == 0
-    except FogError:
-        return False
 
 
 def _failed(name: str, error: FogError) -> Check:

@@ -86,7 +86,7 @@ def test_small_receive_buffers_are_named_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_kernel: bool, sizes: tuple[int, int],
     remedy: str,
 ) -> None:
-    monkeypatch.setattr(doctor, '_kernel_wireguard', lambda: in_kernel)
+    monkeypatch.setattr(doctor.deploy, 'kernel_wireguard', lambda: in_kernel)
     for name, size in zip(('rmem_default', 'rmem_max'), sizes):
         (tmp_path / name).write_text(f'{size}\n')
     check = doctor.receive_buffer(tmp_path)
@@ -96,7 +96,6 @@ def test_small_receive_buffers_are_named_with_the_remedy(
 
 
 def test_missing_wireguard_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, '_succeeds', lambda *words: False)
     monkeypatch.setattr(Path, 'exists', lambda self: False)
     monkeypatch.setattr(process, 'which', lambda program: None)
     check = doctor.wireguard()

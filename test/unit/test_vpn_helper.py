@@ -355,6 +355,19 @@ def test_package_is_removed_while_another_user_has_an_interface(tmp_path: Path) 
     assert not records.exists()
 
 
+def test_kernel_with_wireguard_needs_no_tun(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    monkeypatch.setattr(robot, 'TUN', tmp_path / 'tun')
+    monkeypatch.setattr(process, 'require', lambda *_, **__: None)
+    monkeypatch.setattr(os, 'geteuid', lambda: 0)
+    monkeypatch.setattr(robot, 'kernel_wireguard', lambda: True)
+    robot.check_robot()
+    monkeypatch.setattr(robot, 'kernel_wireguard', lambda: False)
+    with pytest.raises(PrerequisiteError, match='--device /dev/net/tun'):
+        robot.check_robot()
+
+
 def test_user_outside_of_the_group_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, 'which', lambda program: f'/usr/bin/{program}')
     monkeypatch.setattr(process, 'sudo_trouble', lambda: process.PASSWORD)

@@ -575,7 +575,7 @@ def _sharing(request: CreateRequest) -> Iterator[None]:
             failed.callback(process.run, Command(('sh', '-c', _UNSHARE, 'sh', folder), sudo=True),
                             timeout=10.0, check=False)
             process.run(Command(('sh', '-ec', _SHARE, 'sh', folder, *request.common), sudo=True,
-                                what='make the folder of shared topics'), timeout=10.0)
+                                what='make the folder that machines share'), timeout=10.0)
         yield
         failed.pop_all()
 
