@@ -15,6 +15,7 @@ import contextlib
 from importlib.util import find_spec
 from pathlib import Path
 import random
+import shlex
 import socket
 import sys
 from typing import Optional
@@ -30,7 +31,10 @@ TIMEOUT = 5.0
 #: Names in a folder: the file with the daemon's port, and the folder of the program.
 PORT_FILE, PROGRAMS = 'ros2-daemon', 'bin'
 
-_PROGRAM = '''#!{python}
+# A command for sh, and a text for Python: a first line can't name a path that has a space.
+_PROGRAM = """#!/bin/sh
+'''exec' {python} "$0" "$@"
+' '''
 # ros2 with a daemon at a TCP port of its own
 import sys
 
@@ -41,7 +45,7 @@ ros2cli.daemon.get_port = lambda: int(open({port!r}).read())
 from ros2cli.cli import main
 
 sys.exit(main())
-'''
+"""
 
 
 def programs(folder: Path) -> Optional[Path]:
@@ -67,7 +71,8 @@ def install(folder: Path, python: str) -> Path:
     if not program.exists():
         port = folder.absolute() / PORT_FILE
         write_private(port, str(_free_port()).encode())
-        write_private(program, _PROGRAM.format(python=python, port=str(port)).encode())
+        write_private(program, _PROGRAM.format(
+            python=shlex.quote(python), port=str(port)).encode())
         program.chmod(0o700)
     return program.parent
 

@@ -48,6 +48,14 @@ def test_program_gives_the_daemon_another_port(tmp_path: Path) -> None:
     assert (programs / 'ros2').stat().st_mode & 0o777 == 0o700
 
 
+def test_path_of_the_interpreter_may_have_spaces(tmp_path: Path) -> None:
+    python = tmp_path / "it's a folder/python"
+    python.parent.mkdir()
+    python.symlink_to(sys.executable)
+    done = ros2(ros2_daemon.install(tmp_path / 'launch', str(python)))
+    assert (done.stdout.endswith(' topic list\n'), done.returncode) == (True, 3), done.stderr
+
+
 @pytest.mark.parametrize('name', ['launch', "it's a folder"])
 def test_two_terminals_at_once_get_one_port(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
