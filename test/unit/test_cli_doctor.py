@@ -114,10 +114,15 @@ def test_cyclone_configuration_of_the_user_is_checked(
 
 CHAIN = ('table inet filter {\n\tchain input {\n\t\ttype filter hook input priority filter; '
          'policy drop;\n\t\t%s\n\t}\n}\n')
+FIREWALLD = (CHAIN % 'ct state { established, related } accept\n\t\tjump zones\n\t\t'
+             'reject with icmpx admin-prohibited').replace('policy drop', 'policy accept')
 
 
 @pytest.mark.parametrize(('answer', 'verdict'), [
-    (CHAIN % 'ct state established accept', 'warning'),
+    (CHAIN % 'ct state established accept', 'warning'), (FIREWALLD, 'warning'),
+    (FIREWALLD.replace('reject', 'tcp dport 22 reject'), 'ok'),
+    (FIREWALLD.replace('inet filter', 'inet foga1b2c3'), 'ok'),
+    (FIREWALLD.replace('jump zones', 'iifname "fog*" goto filter_IN_trusted'), 'ok'),
     (CHAIN % 'iifname "fog*" accept', 'ok'), ('', 'ok'),
     (PrerequisiteError('sudo not found on this computer', 'install it'), 'warning')])
 def test_dropping_firewall_is_reported(
