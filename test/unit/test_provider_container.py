@@ -494,7 +494,7 @@ def test_downloads_by_sudo_get_the_users_proxies(monkeypatch, tmp_path, options)
 @pytest.mark.parametrize(('owner', 'words', 'remedy'), [
     ('bob-1001', "'m' of the robot bob-1001 already", 'another name='),
     (None, "'m' already", 'another name='),
-    ('me-1000', "'m' already", 'another name=, or: ros2 fog delete m')])
+    ('me-1000', "'m' already", 'ros2 fog delete m')])
 def test_machine_of_another_robot_is_not_the_one_to_delete(monkeypatch, owner, words, remedy):
     def run(command, **more):
         if 'create' in command.argv:

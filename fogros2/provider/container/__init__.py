@@ -266,8 +266,7 @@ class ContainerProvider(Provider):
             whose = f' of the robot {owner}' if owner and not own else ''
             raise NameTaken(
                 f"there is a container machine '{name}'{whose} already",
-                'give the machine another name='
-                + (f', or: ros2 fog delete {name}' if own else '')) from error
+                f'ros2 fog delete {name}' if own else 'give the machine another name=') from error
         return str(reports[0]['Id'])
 
     def _create_from_root(
