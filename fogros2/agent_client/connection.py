@@ -32,6 +32,9 @@ RESTART = 35.0
 #: Seconds after which nobody waits for it on the way down, or for a program without an answer.
 PATIENCE = 5.0
 
+#: Bytes of a long request that are written at once.
+PIECE = 1 << 14
+
 #: A request without a waiting caller; its reply shows that the agent is there.
 _PING = b'{"id":0,"command":"ping"}\n'
 
@@ -73,6 +76,8 @@ class AgentClient:
         self._lock = threading.Lock()
         self._writing = threading.Lock()
         self._heard = 0.0
+        #: Seconds in which the link took pieces of long requests.
+        self._sending = 0.0
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
         self._stream: Optional[Stream] = None
@@ -89,7 +94,10 @@ class AgentClient:
 
     @property
     def silent_for(self) -> float:
-        """Seconds since the last data from the machine; normally up to ``SILENCE / 4``."""
+        """
+        Seconds since the last data from the machine, or since the link took a piece of a long
+        request; normally up to ``SILENCE / 4``.
+        """
         return time.monotonic() - self._heard
 
     def connect(self) -> None:
@@ -121,7 +129,8 @@ class AgentClient:
         If the connection breaks, the client reconnects and repeats the request, except ``signal``,
         which would take effect twice.
 
-        :param timeout: seconds, including the time of lost connections.
+        :param timeout: seconds, including the time of lost connections, but not the time in which
+            the link takes long requests.
         :param silent: seconds without any data after which the request fails earlier; must be more
             than half of ``SILENCE``, because a busy agent still answers pings. An absent agent
             then gets ``PATIENCE`` seconds instead of ``RESTART``.
@@ -141,15 +150,14 @@ class AgentClient:
             stream = self._stream
         if stream is not None:
             self._send(stream, line)
-        begin = time.monotonic()
+        begin = self._clock()
         deadline = begin + timeout
         try:
-            while not pending.done.wait(min(0.1, max(0.0, deadline - time.monotonic()))):
-                if time.monotonic() >= deadline:
+            while not pending.done.wait(min(0.1, max(0.0, deadline - self._clock()))):
+                if self._clock() >= deadline:
                     raise DeadlineExceeded(
                         f"the agent didn't answer '{command}' within {timeout:g} s")
-                if silent is not None and min(
-                        self.silent_for, time.monotonic() - begin) > silent:
+                if silent is not None and min(self.silent_for, self._clock() - begin) > silent:
                     raise DeadlineExceeded(
                         f"the agent sent nothing for {silent:g} s and didn't answer '{command}'")
                 absent_since = self._absent_since
@@ -325,7 +333,16 @@ class AgentClient:
     def _send(self, stream: Stream, line: bytes) -> None:
         """Write a line; after a connection error the reading thread repeats the requests."""
         with self._writing, contextlib.suppress(ConnectError):
-            stream.write(line)
+            for position in range(0, len(line), PIECE):
+                begin = time.monotonic()
+                stream.write(line[position:position + PIECE])
+                if position > 0:  # a single piece may wait in the buffers of a dead connection
+                    self._heard = time.monotonic()
+                    self._sending += self._heard - begin
+
+    def _clock(self) -> float:
+        """Return a monotonic time in seconds that stands still while the link takes pieces."""
+        return time.monotonic() - self._sending
 
     def _watch(self) -> None:
         """Ping a silent connection, and close it if nothing comes back."""

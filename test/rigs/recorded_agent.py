@@ -38,9 +38,11 @@ class ScriptedStream:
         self.answer = answer
         self.lines: queue.Queue[bytes] = queue.Queue()
         self.asked: list[dict[str, Any]] = []
+        self.received = b''
 
     def write(self, data: bytes) -> None:
-        for line in data.splitlines():
+        *lines, self.received = (self.received + data).split(b'\n')
+        for line in lines:
             request = json.loads(line)
             self.asked.append(request)
             for message in self.answer(request):

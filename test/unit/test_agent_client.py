@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from math import inf, nan
 import socket
+import threading
 import time
 from typing import Any
 
@@ -292,6 +293,30 @@ def test_silent_connection_is_replaced(make):
     # one that answers is kept
     until(lambda: sum(request['command'] == 'ping' for request in second.asked) > 4)
     assert len(seen) == 2
+
+
+class SlowStream(ScriptedStream):
+    """An agent behind a link of 160 kB/s."""
+
+    def __init__(self, answer: Callable[[dict[str, Any]], list[Any]]) -> None:
+        super().__init__(answer)
+        self.closed = threading.Event()
+
+    def write(self, data: bytes) -> None:
+        if self.closed.wait(len(data) / 160e3):
+            raise ConnectError('closed')
+        super().write(data)
+
+    def close(self) -> None:
+        self.closed.set()
+        super().close()
+
+
+def test_long_request_passes_a_slow_link_also_when_it_is_repeated(make):
+    breaking = ScriptedStream(lambda request: [None] if request['command'] == 'start' else [])
+    client = make(breaking, SlowStream(lambda request: [done(request, known=[])]), silence=1.5)
+    client.request('start', nodes='x' * 400_000, timeout=1.5)
+    assert len(client._shell.opened) == 2
 
 
 #: Messages of a hijacked machine, and the field of each that is wrong; test_untrusted.py has more.
