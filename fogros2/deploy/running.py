@@ -11,6 +11,7 @@ import time
 from typing import Any, Optional
 
 from fogros2 import feature
+from fogros2.agent.protocol import MAX_LINE
 from fogros2.agent_client import EventCallback
 from fogros2.deploy.context import Context
 from fogros2.deploy.life import Phase
@@ -20,7 +21,7 @@ from fogros2.deploy.steps.watching import POLL_INTERVAL, Watch
 from fogros2.deploy.undo import OPEN_PORT
 from fogros2.errors import AgentError, DeadlineExceeded, FogError
 from fogros2.events import Event, NodeStatus
-from fogros2.model import Machine, MachineSpec, NodeSpec
+from fogros2.model import Machine, MachineSpec, NodeSpec, to_json
 from fogros2.report import Warned
 from fogros2.waiting import wait_until
 
@@ -32,6 +33,28 @@ class _Watched:
     argv: Sequence[str]
     interval: float
     then: Callable[[str], None]
+
+
+def _groups(nodes: Sequence[NodeSpec]) -> list[list[NodeSpec]]:
+    """
+    Divide nodes into groups that each fit into a request.
+
+    :raises AgentError: a node is too large.
+    """
+    groups: list[list[NodeSpec]] = []
+    room, limit = 0, MAX_LINE - 1024  # the rest of a request
+    for node in nodes:
+        size = len(to_json(node)) + 1
+        if size > limit:
+            raise AgentError(
+                f"'{node.name}' can't be sent: with its parameter files it has {size} bytes, more "
+                f'than {limit}', 'put large data into the workspace, and read it there')
+        if size > room:
+            groups.append([])
+            room = limit
+        groups[-1].append(node)
+        room -= size
+    return groups
 
 
 class RunningMachine(MachineJob):
@@ -81,10 +104,12 @@ class RunningMachine(MachineJob):
         Start nodes; their state changes arrive as events.
 
         :raises PrerequisiteError: the machine cannot get what they need.
+        :raises AgentError: refused, or a node is too large for a request.
         """
         for each, own in feature.used(self.spec):
             nodes = each.starting(self, nodes, own)
-        self.agent.request('start', nodes=self.modules.fitted(nodes))
+        for group in _groups(self.modules.fitted(nodes)):
+            self.agent.request('start', nodes=group)
 
     def watch(
         self, name: str, argv: Sequence[str], interval: float, then: Callable[[str], None],

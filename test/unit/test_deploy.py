@@ -57,6 +57,7 @@ from fogros2.model import (
     Machine,
     MachineSpec,
     MachineState,
+    NodeSpec,
     Peer,
     Result,
 )
@@ -802,6 +803,23 @@ def test_agent_that_was_started_again_gets_router_and_watches(launch, provider):
     assert [command for command, _ in requests] == ['watch', 'start', 'watch']
     assert requests[1][1]['nodes'][0].executable == 'rmw_zenohd'
     assert requests[2:] == before
+
+
+def test_nodes_start_in_requests_that_the_agent_can_take(launch, provider, monkeypatch):
+    _, mine = begun(launch)
+    monkeypatch.setattr('fogros2.feature.used', lambda spec: ())
+    requests = []
+    mine.modules = SimpleNamespace(fitted=list)
+    mine.agent = SimpleNamespace(
+        request=lambda command, nodes: requests.append([node.name for node in nodes]))
+
+    def node(name, size):
+        return NodeSpec(f'{name}.1', name, files={'large.yaml': 'x' * size})
+    mine.start([node('a', 9_000_000), node('b', 7_000_000), node('c', 2_000_000), node('d', 0)])
+    assert requests == [['a', 'b'], ['c', 'd']]
+    with pytest.raises(AgentError, match=r"'e' can't be sent: .* it has 170002\d\d bytes"):
+        mine.start([node('a', 0), node('e', 17_000_000)])
+    assert len(requests) == 2
 
 
 def test_agent_that_was_started_again_watches_for_the_notice(launch, provider, monkeypatch):
