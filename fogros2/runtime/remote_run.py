@@ -11,7 +11,13 @@ from typing import Any, Optional, Protocol, Union
 
 from launch import LaunchContext
 from launch.actions import ExecuteLocal
-from launch.events.process import ProcessExited, ProcessStarted, ProcessStderr, ProcessStdout
+from launch.events.process import (
+    ProcessExited,
+    ProcessIO,
+    ProcessStarted,
+    ProcessStderr,
+    ProcessStdout,
+)
 import launch.logging
 
 from fogros2.events import Event, NodeExited, NodeOutput, NodeStarted
@@ -33,6 +39,10 @@ _NO_SCREEN = re.compile(
 GRACE = 10.0
 #: Seconds after a process's start in which it may still import what handles SIGINT.
 STARTING = 5.0
+#: Characters of a line after which launch, which joins its parts, gets an end of the line.
+LONGEST_LINE = 1 << 16
+#: Characters of output that are withheld, and those that an event counts beside its text.
+WITHHELD, OVERHEAD = 1 << 20, 1000
 
 
 class Home(Protocol):
@@ -84,6 +94,8 @@ class RemoteRun:
         self._started_at = 0.0
         #: Output since the process was stopped while it started; None for other processes.
         self._withheld: Optional[list[NodeOutput]] = None
+        #: Characters since the last end of a line, by stream.
+        self._unended: dict[type[ProcessIO], int] = {}
         self._context = context
         self._session = session
         self._details: dict[str, Any] = dict(action.process_details or {})
@@ -213,15 +225,26 @@ class RemoteRun:
     def _print(self, event: NodeOutput) -> None:
         if self._withheld is not None:
             self._withheld.append(event)
+            if sum(OVERHEAD + len(each['text']) for each in self._withheld) > WITHHELD:
+                withheld, self._withheld = self._withheld, None
+                for each in withheld:
+                    self._print(each)
             return
         if not self._hinted and _NO_SCREEN.search(event['text']):
             self._hinted = True
             self._logger.warning(
                 'the process opens a window, and a machine has no screen: run the node on the '
                 'robot, switch its window off, or set QT_QPA_PLATFORM=offscreen for it')
+        text = event['text']
         kind = ProcessStderr if event['stream'] == 'stderr' else ProcessStdout
+        unended = 0 if '\n' in text else self._unended.get(kind, 0)
+        unended += len(text) - text.rfind('\n') - 1
+        if unended >= LONGEST_LINE:
+            text += '\n'
+            unended = 0
+        self._unended[kind] = unended
         self._details.setdefault('pid', 0)
-        self._context.emit_event_sync(kind(text=event['text'].encode(), **self._details))
+        self._context.emit_event_sync(kind(text=text.encode(), **self._details))
 
     def _report_exit(self, event: NodeExited) -> None:
         self._returncode = event['returncode']

@@ -786,6 +786,30 @@ def test_node_that_ended_while_it_started_is_a_warning(
     assert bool(text and text in said) != half and node.return_code == returncode
 
 
+def test_output_without_an_end_is_passed_on_in_lines(run, fake, planner):
+    part, lines = 'x' * 40_000, ['']
+
+    def collect(event):
+        first, *others = event.text.decode().split('\n')
+        lines[-1] += first
+        lines.extend(others)
+
+    def on_start(machine, node):
+        def stop(ids):
+            for _ in range(30):
+                machine.say('output', node, stream='stderr', text=part)
+            machine.say('exited', node, returncode=-2, respawns=False)
+        machine.stop = stop
+
+    fake.on_start = on_start
+    node = talker(planner)
+    assert run(LaunchDescription([
+        RegisterEventHandler(OnProcessIO(target_action=node, on_stderr=collect)),
+        node, RegisterEventHandler(OnProcessStart(target_action=node, on_start=[Shutdown()])),
+    ])) == 0
+    assert lines == [2 * part] * 15 + ['']
+
+
 def test_shutdown_cancels_a_machine_that_comes_up(run, fake, planner):
     fake.waits['planner'] = threading.Event()
     assert run(FogROSLaunchDescription([
