@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import codecs
+from collections import deque
 from collections.abc import Callable
 import contextlib
 import functools
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 CHUNK, CHUNKS = 1 << 16, 16
 #: Maximum number of bytes of the variables that setup files set.
 VARIABLES = 1 << 20
+#: The number of nodes that are remembered after they have ended.
+ENDED = 300
 #: Seconds from one signal to the next where all nodes have to end quickly.
 QUICK = (0.4, 0.4)
 #: Linux: the option of prctl for the signal that a process gets when its parent dies.
@@ -101,6 +104,8 @@ class Node:
         #: Command line, and options of ``Popen``; empty until they are known.
         self.command: list[str] = []
         self.options: Json = {}
+        #: The folder of its files, '' without files.
+        self.folder = ''
         #: Timers of the signals that stop it, or of its next start.
         self.timers: list[Timer] = []
         self.status: NodeStatus = {
@@ -132,8 +137,10 @@ class Nodes:
         self.config = config
         self.emit = emit
         self.mark = f'{os.getpid()}-{time.time_ns()}'
-        #: The nodes of the launch that have been started, by id.
+        #: The nodes that the launch has started, by id, without those that ended long ago.
         self.known: dict[str, Node] = {}
+        #: Those that have ended, in this order.
+        self.ended: deque[Node] = deque()
         #: Variables of the nodes, and the settings that they were read for.
         self.environment: dict[str, str] = {}
         self.settings: Any = None
@@ -273,6 +280,7 @@ class Nodes:
             node.status['state'], node.status['error'] = 'refused', reason.answer['error']
             self._report(node, 'refused', error=reason.answer['error'],
                          hint=reason.answer['hint'])
+            self._forget(node)
         else:
             node.status['state'], node.status['pid'] = 'running', pid
             self._report(node, 'started', pid=pid, cmd=node.command)
@@ -344,6 +352,7 @@ class Nodes:
         try:
             if texts:
                 os.mkdir(folder, 0o700)
+                node.folder = folder
             for number, key in enumerate(texts):
                 name = re.sub(r'[^A-Za-z0-9._-]', '_', os.path.basename(key)) or 'file'
                 files[key] = f'{folder}/{number}-{name[-100:]}'
@@ -372,7 +381,19 @@ class Nodes:
         self._report(node, 'exited', returncode=status, respawns=respawns)
         if respawns:
             node.timers.append(self.loop.at(node.respawn_delay, lambda: self._run(node)))
+        else:
+            self._forget(node)
         self._check_ended()
+
+    def _forget(self, node: Node) -> None:
+        """Free the memory of a node that has ended; forget the one that ended first of many."""
+        node.spec, node.command, node.options = {}, [], {}
+        self.ended.append(node)
+        if len(self.ended) > ENDED:
+            first = self.ended.popleft()
+            self.known.pop(first.id, None)
+            if first.folder:
+                remove_tree(first.folder)
 
     def _stop(self, node: Node, timeouts: tuple[float, float]) -> None:
         """Stop a node's process by SIGINT, and by SIGTERM and SIGKILL after time-outs."""
@@ -385,6 +406,7 @@ class Nodes:
                 node.status['state'] = 'exited'
                 self._report(node, 'exited', returncode=node.status['returncode'],
                              respawns=False)
+                self._forget(node)
             return
         kill = functools.partial(self.processes.kill, pid)
         kill(signal.SIGINT)
@@ -402,7 +424,7 @@ class Nodes:
             return
         self.stopping = True
         longest = 0.0
-        for node in self.known.values():
+        for node in list(self.known.values()):
             timeouts = QUICK if quickly else node.timeouts
             if node.status['pid'] is not None:
                 longest = max(longest, sum(timeouts))

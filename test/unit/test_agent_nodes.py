@@ -210,3 +210,26 @@ def test_unknown_node_keeps_no_other_from_its_end(
     nodes.known['a'].status['pid'] = 4711
     nodes.stop(['a', 'nobody'])
     assert sent == [(4711, signal.SIGINT)]
+
+
+def test_nodes_that_ended_long_ago_are_forgotten(
+    nodes: Nodes, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    exits: list[Callable[[int], None]] = []
+
+    def start(argv: list[str], exited: Callable[[int], None], **options: Any) -> int:
+        exits.append(exited)
+        return 4711
+
+    monkeypatch.setattr(nodes.processes, 'start', start)
+    monkeypatch.setattr('fogros2.agent.nodes.ENDED', 2)
+    started = [Node({'id': number, 'name': 'n', 'arguments': ['true', [{'file': 'k'}]],
+                     'files': {'k': 'text'}}) for number in 'abcd']
+    nodes.start(started)
+    folders = [Path(node.folder) for node in started]
+    for index in (3, 1, 0):
+        exits[index](0)
+    assert list(nodes.known) == ['a', 'b', 'c']
+    assert [folder.exists() for folder in folders] == [True, True, True, False]
+    assert [bool(node.spec) for node in started] == [False, False, True, False]
+    assert nodes.start(started[:3]) == ['a', 'b', 'c']
