@@ -7,7 +7,7 @@ The file has one JSON line per event. It is deleted with the folder when the lau
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import contextlib
 import dataclasses
 import json
@@ -15,7 +15,7 @@ import os
 from pathlib import Path
 import threading
 import time
-from typing import Optional
+from typing import Any, Optional
 
 from fogros2.clock import ClockOffset
 from fogros2.report import (
@@ -115,67 +115,57 @@ class Step:
     fatal: bool = True
 
 
-def steps(lines: list[str]) -> list[Step]:
+class Contents:
     """
-    Return the steps in the lines of a journal, in the order in which they began.
+    The contents of a journal, which grow by its lines; damaged lines are ignored.
 
-    Damaged lines are ignored.
+    :ivar steps: in the order in which they began.
+    :ivar clocks: the last offset of each machine's clock.
     """
-    entries: list[Step] = []
-    for line in lines:
-        try:
-            event = json.loads(line)
-            machine, name = str(event['machine']), str(event['step'])
-            kind, at = event['event'], float(event['time'])
-            if kind == 'started':
-                entries.append(Step(machine, name, at))
-                continue
-            index = next((i for i in reversed(range(len(entries))) if entries[i].state == 'running'
-                          and (entries[i].machine, entries[i].step) == (machine, name)), None)
-            if kind == 'progress':
-                if index is not None:
-                    entries[index] = dataclasses.replace(
-                        entries[index], done=int(event['done']), total=int(event['total']))
-            elif kind in ('done', 'failed'):
-                seconds = float(event['seconds'])
-                if index is None:
-                    # a failed undo step is reported only at its end
-                    entries.append(Step(machine, name, at - seconds))
-                    index = len(entries) - 1
-                entries[index] = dataclasses.replace(
-                    entries[index], state=kind, seconds=seconds, detail=str(event['detail']),
-                    fatal=bool(event.get('fatal', True)))
-        except (ValueError, TypeError, KeyError, RecursionError):
-            continue
-    return entries
 
+    def __init__(self, lines: Iterable[str] = ()) -> None:
+        self.steps: list[Step] = []
+        self.clocks: dict[str, ClockOffset] = {}
+        for line in lines:
+            self.add(line)
 
-def clocks(lines: list[str]) -> dict[str, ClockOffset]:
-    """Return the last offset of each machine's clock in a journal."""
-    offsets: dict[str, ClockOffset] = {}
-    for line in lines:
-        try:
+    def add(self, line: str) -> None:
+        """Add the next line."""
+        with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):
             event = json.loads(line)
             if event['event'] == 'clock':
-                offsets[str(event['machine'])] = ClockOffset(
+                self.clocks[str(event['machine'])] = ClockOffset(
                     float(event['seconds']), float(event['uncertainty']))
-        except (ValueError, TypeError, KeyError, RecursionError):
-            continue
-    return offsets
+            else:
+                self._add_step(event)
+
+    def _add_step(self, event: dict[str, Any]) -> None:
+        entries = self.steps
+        machine, name = str(event['machine']), str(event['step'])
+        kind, at = event['event'], float(event['time'])
+        if kind == 'started':
+            entries.append(Step(machine, name, at))
+            return
+        index = next((i for i in reversed(range(len(entries))) if entries[i].state == 'running'
+                      and (entries[i].machine, entries[i].step) == (machine, name)), None)
+        if kind == 'progress':
+            if index is not None:
+                entries[index] = dataclasses.replace(
+                    entries[index], done=int(event['done']), total=int(event['total']))
+        elif kind in ('done', 'failed'):
+            seconds = float(event['seconds'])
+            if index is None:
+                # a failed undo step is reported only at its end
+                entries.append(Step(machine, name, at - seconds))
+                index = len(entries) - 1
+            entries[index] = dataclasses.replace(
+                entries[index], state=kind, seconds=seconds, detail=str(event['detail']),
+                fatal=bool(event.get('fatal', True)))
 
 
-def read_clocks(folder: Path) -> dict[str, ClockOffset]:
-    """Return the offsets in the journal of a launch's folder, empty without a journal."""
-    return clocks(_lines(folder))
-
-
-def read_steps(folder: Path) -> list[Step]:
-    """Return the steps in the journal of a launch's folder, empty without a journal."""
-    return steps(_lines(folder))
-
-
-def _lines(folder: Path) -> list[str]:
+def read(folder: Path) -> Contents:
+    """Return the contents of the journal of a launch's folder, empty without a journal."""
     try:
-        return (folder / FILE).read_text(errors='replace').splitlines()
+        return Contents((folder / FILE).read_text(errors='replace').splitlines())
     except OSError:
-        return []
+        return Contents()

@@ -35,7 +35,7 @@ def up(name: str, timeout: float) -> None:
                                          'its own output says why')
             return False
         seen = record.launch
-        steps = journal.read_steps(store.root / 'launches' / record.launch)
+        steps = journal.read(store.root / 'launches' / record.launch).steps
         return shown.phase(tuple(step for step in steps if step.machine == name)) == 'running'
 
     wait_until(probe, timeout=timeout, interval=0.1, what=f"'{name}'",

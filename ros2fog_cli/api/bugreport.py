@@ -103,7 +103,7 @@ def machines(records: Iterable[Record]) -> Iterator[str]:
 def steps(store: Store) -> Iterator[str]:
     """Yield the steps of launches that run."""
     for launch in sorted({record.launch for record in store.machines() if record.launch}):
-        for step in journal.read_steps(store.root / 'launches' / launch):
+        for step in journal.read(store.root / 'launches' / launch).steps:
             seconds = '' if step.seconds is None else f' {step.seconds:.2f} s'
             yield (f"{step.machine or 'robot'}: {step.step} {step.state}{seconds}"
                    + f': {step.detail}' * bool(step.detail))

@@ -269,9 +269,9 @@ class Live:
             shown.launch = record.launch
         launch = self._launches.get(shown.launch)
         if launch is not None:
-            shown.steps = tuple(step for step in launch.steps
+            shown.steps = tuple(step for step in launch.contents.steps
                                 if step.machine == shown.entry.name)
-            shown.clock = launch.clocks.get(shown.entry.name)
+            shown.clock = launch.contents.clocks.get(shown.entry.name)
         folder = self.store.root / 'launches' / shown.launch
         shown.figures = {name: rows for name, each in self._tables.items()
                          if (rows := each.figures(folder, shown.entry.name)) is not None}
@@ -284,7 +284,7 @@ class Live:
         elif shown.follower is not None:
             shown.follower.know(shown.entry)
         elif record.agent and (
-                not (launch and launch.steps) or phase(shown.steps) == 'running'):
+                not (launch and launch.contents.steps) or phase(shown.steps) == 'running'):
             shown.follower = Follower(shown.entry, self._wake.set)
 
     # -- as JSON --------------------------------------------------------------------------------
@@ -295,7 +295,7 @@ class Live:
             'warnings': list(self._warnings),
             'launches': [
                 {'id': name, 'pid': launch.pid, 'alive': launch.alive and not launch.ended,
-                 'steps': [as_json(step) for step in launch.steps if not step.machine]}
+                 'steps': [as_json(step) for step in launch.contents.steps if not step.machine]}
                 for name, launch in sorted(
                     self._launches.items(), key=lambda item: item[1].ended or 1e12)],
             'machines': [machine_json(key, shown) for key, shown in sorted(self._shown.items())],

@@ -253,7 +253,7 @@ def clock(record: Record, store: Store) -> Optional[ClockOffset]:
     """Return the clock offset that the launch measured last, None if there is none."""
     if not record.launch or not record.launch_alive:
         return None
-    return journal.read_clocks(store.root / 'launches' / record.launch).get(record.name)
+    return journal.read(store.root / 'launches' / record.launch).clocks.get(record.name)
 
 
 def follow(

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
-import os
 from pathlib import Path
 import time
 from typing import Any, Optional, TextIO
@@ -55,22 +54,19 @@ class ShownLaunch:
     alive: bool = True
     #: The open journal: the launch deletes its folder, and the last lines must still be readable.
     file: Optional[TextIO] = None
-    size: int = 0
-    steps: tuple[journal.Step, ...] = ()
-    clocks: Mapping[str, ClockOffset] = dataclasses.field(default_factory=dict)
+    #: The beginning of a line that is not complete yet.
+    rest: str = ''
+    contents: journal.Contents = dataclasses.field(default_factory=journal.Contents)
     ended: float = 0.0
 
     def read(self, folder: Path) -> None:
-        """Read the journal again if it has grown."""
+        """Read the new lines of the journal."""
         with contextlib.suppress(OSError):  # there is no journal yet
             if self.file is None:
                 self.file = open(folder / journal.FILE, errors='replace')
-            size = os.fstat(self.file.fileno()).st_size
-            if size != self.size:
-                self.size = size
-                self.file.seek(0)
-                lines = self.file.read().splitlines()
-                self.steps, self.clocks = tuple(journal.steps(lines)), journal.clocks(lines)
+            *lines, self.rest = (self.rest + self.file.read()).split('\n')
+            for line in lines:
+                self.contents.add(line)
 
     def close(self) -> None:
         """Close the journal."""

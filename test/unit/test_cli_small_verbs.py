@@ -106,7 +106,8 @@ def test_wait_ends_when_the_machine_is_up() -> None:
 
 def test_wait_fails_when_the_launch_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = threading.Event()
-    monkeypatch.setattr(awaiting.journal, 'read_steps', lambda folder: seen.set() or [])
+    monkeypatch.setattr(
+        awaiting.journal, 'read', lambda folder: seen.set() or awaiting.journal.Contents())
     record('a')
     status: list[Any] = []
     waits = threading.Thread(target=lambda: status.append(run('wait', 'a', '--timeout', '20')))

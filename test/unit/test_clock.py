@@ -184,9 +184,9 @@ def test_journal_keeps_the_last_offset(tmp_path: Path) -> None:
         keep(ClockMeasured('planner', offset))
     with (tmp_path / journal.FILE).open('a') as file:
         file.write('{"machine": "planner", "event": "clock", "seconds": "x"}\n[]\n7\n')
-    assert journal.read_clocks(tmp_path) == {'planner': ClockOffset(0.2, 0.01)}
-    assert journal.steps((tmp_path / journal.FILE).read_text().splitlines()) == []
-    assert journal.read_clocks(tmp_path / 'none') == {}
+    assert journal.read(tmp_path).clocks == {'planner': ClockOffset(0.2, 0.01)}
+    assert journal.read(tmp_path).steps == []
+    assert journal.read(tmp_path / 'none').clocks == {}
 
 
 def test_status_and_doctor_show_the_offset_of_a_running_launch(

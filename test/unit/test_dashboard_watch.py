@@ -32,12 +32,11 @@ from ros2fog_cli.api import screen
 from ros2fog_cli.api.follower import node_name, rates
 from ros2fog_cli.api.machines import Entry
 from ros2fog_cli.api.reach import Link
-from ros2fog_cli.api.shown import as_json, machine_json, phase, Shown
+from ros2fog_cli.api.shown import as_json, machine_json, phase, Shown, ShownLaunch
 
 
 def read(folder: Path) -> list[Step]:
-    path = folder / journal.FILE
-    return journal.steps(path.read_text().splitlines()) if path.exists() else []
+    return journal.read(folder).steps
 
 
 def test_journal_forwards_and_stores_events(tmp_path: Path) -> None:
@@ -97,14 +96,35 @@ def test_journal_accepts_events_of_several_threads(tmp_path: Path) -> None:
     '{"time": 1, "machine": "a", "st', '[' * 100_000])
 def test_damaged_line_of_a_journal_is_skipped(line: str) -> None:
     good = '{"time": 1, "machine": "a", "step": "s", "event": "started"}'
-    assert journal.steps([line, good, line]) in (
+    assert journal.Contents([line, good, line]).steps in (
         [Step('a', 's', 1.0)], [Step('a', 's', 1.0, done=1, total=2)])
+
+
+def test_watched_journal_is_parsed_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    launch, parsed, loads = ShownLaunch(), [], json.loads
+    monkeypatch.setattr(journal.json, 'loads', lambda line: parsed.append(line) or loads(line))
+    event = {'time': 1, 'event': 'started', 'machine': 'a', 'step': 's'}
+
+    def write(text: str) -> None:
+        with open(tmp_path / journal.FILE, 'a') as file:
+            file.write(text)
+        launch.read(tmp_path)
+
+    progress = json.dumps({**event, 'event': 'progress', 'done': 1, 'total': 2}) + '\n'
+    write(json.dumps(event) + '\n' + 5000 * progress + progress[:9])
+    assert len(parsed) == 5001
+    write(progress[9:])
+    assert len(parsed) == 5002
+    assert launch.contents.steps == [Step('a', 's', 1.0, done=1, total=2)]
 
 
 def test_step_that_only_failed_has_its_begin() -> None:
     line = ('{"time": 10, "machine": "a", "step": "left there", "event": "failed", '
             '"seconds": 2, "detail": "silent"}')
-    assert journal.steps([line]) == [Step('a', 'left there', 8.0, 'failed', 2.0, 'silent')]
+    assert journal.Contents([line]).steps == [
+        Step('a', 'left there', 8.0, 'failed', 2.0, 'silent')]
 
 
 @pytest.mark.parametrize(('steps', 'expected'), [
