@@ -26,6 +26,8 @@ TUN_REMEDY = f'sudo modprobe tun; in a container: start it with --device {TUN}'
 
 #: Held while sudo may ask for a password, so that only one thread asks.
 _ASKING = threading.Lock()
+#: Held while resources of a dead launch are deleted, which several of its machines may want.
+_CLEARING = threading.Lock()
 
 
 def provider(name: str) -> Provider:
@@ -100,13 +102,14 @@ def clear(folder: Path) -> None:
 
     :raises FogError: a resource could not be deleted.
     """
-    name, own = f'fog{folder.name}', folder / 'vpn.key'
-    key = helped.key_of(name) or str(own)
-    if not own.exists() and not (owner.INTERFACES / name).exists() and helped.permitted():
-        # nothing is left that needs root: root's commands make the key first, and remove it last
-        key = helped.key_file(name)
-    interface = plan.robot_interface(folder.name, '127.0.0.0/24', 0, key, 0)
-    ros2_daemon.stop(folder)
-    vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
-    run(vpn.down(interface), timeout=Timeouts().vpn)
-    delete_folder(folder)
+    with _CLEARING:
+        name, own = f'fog{folder.name}', folder / 'vpn.key'
+        key = helped.key_of(name) or str(own)
+        if not own.exists() and not (owner.INTERFACES / name).exists() and helped.permitted():
+            # nothing is left that needs root: its commands make the key first, and remove it last
+            key = helped.key_file(name)
+        interface = plan.robot_interface(folder.name, '127.0.0.0/24', 0, key, 0)
+        ros2_daemon.stop(folder)
+        vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')()
+        run(vpn.down(interface), timeout=Timeouts().vpn)
+        delete_folder(folder)

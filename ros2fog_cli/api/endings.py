@@ -292,9 +292,28 @@ class Due:
 
 def due(
     entries: Iterable[Entry], store: Store, keep_stopped: float, report: Reporter,
-) -> Iterator[Due]:
-    """Yield what gc should clear: machines, and what dead launches left on this robot."""
+) -> Iterator[list[Due]]:
+    """
+    Yield what gc should clear: machines, requests, and what dead launches left on this robot.
+
+    The things in a list can be cleared at the same time, before the next list.
+    """
     now = time.time()
+    yield list(_due_machines(entries, store, keep_stopped, report, now))
+    yield [Due('machine', record.name, 'its provider had not answered the request for it',
+               functools.partial(end_request, record, age, store))
+           for record, age in store.requests()]
+    folders = leftovers(store, now)
+    launches = {record.launch for record in store.machines()}
+    folders += [store.root / 'launches' / launch for launch in owner.abandoned()
+                if launch not in launches and store.root / 'launches' / launch not in folders]
+    yield [Due('leftovers of launch', folder.name, 'the launch is gone',
+               functools.partial(clear, folder)) for folder in folders]
+
+
+def _due_machines(
+    entries: Iterable[Entry], store: Store, keep_stopped: float, report: Reporter, now: float,
+) -> Iterator[Due]:
     for entry in entries:
         record = entry.record
         dead = record is not None and record.launch and not record.launch_alive
@@ -317,16 +336,6 @@ def due(
                 continue
             yield Due('leftovers of', entry.name, reason,
                       functools.partial(let_go, record, machine, store))
-    for record, age in store.requests():
-        yield Due('machine', record.name, 'its provider had not answered the request for it',
-                  functools.partial(end_request, record, age, store))
-    folders = leftovers(store, now)
-    launches = {record.launch for record in store.machines()}
-    folders += [store.root / 'launches' / launch for launch in owner.abandoned()
-                if launch not in launches and store.root / 'launches' / launch not in folders]
-    for folder in folders:
-        yield Due('leftovers of launch', folder.name, 'the launch is gone',
-                  functools.partial(clear, folder))
 
 
 def end_request(record: Record, age: float, store: Store) -> None:

@@ -21,6 +21,8 @@ class GcVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Clean up; return 1 if something still exists that should be deleted."""
+        from concurrent.futures import ThreadPoolExecutor
+
         from fogros2.errors import FogError
         from fogros2.store import Store
         from ros2fog_cli.api import endings, machines, progress
@@ -32,16 +34,19 @@ class GcVerb(VerbExtension):
                 verb = 'would clear' if args.dry_run else 'cleared'
                 say(f"{'could not clear' if error else verb} {what} {name}: {error or reason}")
 
+        def end(due: endings.Due) -> str:
+            try:
+                if not args.dry_run:
+                    due.end()
+            except FogError as problem:
+                return str(problem)
+            return due.error
+
         entries = machines.survey(warn, regions=args.region, store=store)
-        with progress.working('clearing'):
-            for due in endings.due(entries, store, args.keep_stopped * 86400, progress.report):
-                error = due.error
-                try:
-                    if not args.dry_run:
-                        due.end()
-                except FogError as problem:
-                    error = str(problem)
-                note(due.what, due.name, due.reason, error)
+        with progress.working('clearing'), ThreadPoolExecutor(16, 'fog-gc') as pool:
+            for dues in endings.due(entries, store, args.keep_stopped * 86400, progress.report):
+                for due, error in zip(dues, pool.map(end, dues)):
+                    note(due.what, due.name, due.reason, error)
             if not args.dry_run:
                 store.sweep()
                 for what in endings.tidy(warn, regions=args.region):

@@ -14,6 +14,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import threading
 import time
 from typing import Any, Optional
 from unittest.mock import Mock
@@ -513,6 +514,21 @@ def test_gc_clears_and_reports_leftovers(capsys: pytest.CaptureFixture[str]) -> 
     capsys.readouterr()
     assert run('gc') == 0
     assert capsys.readouterr().out == 'nothing to clear\n'
+
+
+def test_gc_deletes_machines_in_parallel(monkeypatch: pytest.MonkeyPatch) -> None:
+    together, destroy = threading.Barrier(3, timeout=60), Memory.destroy
+
+    def slow(self: Memory, machine_id: str) -> None:
+        together.wait()
+        destroy(self, machine_id)
+
+    monkeypatch.setattr(Memory, 'destroy', slow)
+    for name in 'abc':
+        machine(name)
+        record(name, **dead())
+    assert run('gc') == 0
+    assert not Memory.machines and not Store().machines()
 
 
 def test_gc_fails_if_a_provider_does_not_answer(
