@@ -312,7 +312,7 @@ class SlowStream(ScriptedStream):
         super().close()
 
 
-def test_long_request_passes_a_slow_link_also_when_it_is_repeated(make):
+def test_long_request_passes_a_slow_link_also_again(make):
     breaking = ScriptedStream(lambda request: [None] if request['command'] == 'start' else [])
     client = make(breaking, SlowStream(lambda request: [done(request, known=[])]), silence=1.5)
     client.request('start', nodes='x' * 400_000, timeout=1.5)
