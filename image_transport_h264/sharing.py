@@ -26,7 +26,7 @@ MOST, UNLIMITED = 1e12, 1e9
 #: it needs ROOM times what it uses; the need stays while it is between STEADY times the use.
 LIMITED, ROOM, STEADY = 0.6, 2.0, (1.4, 3.0)
 #: Maximum number of streams of a link, and of links of a stream.
-MOST_STREAMS, MOST_LINKS = 64, 16
+MOST_STREAMS, MOST_LINKS = 1024, 16
 #: Names of links. A machine chooses among them: an encoder publishes nowhere else, such as on the
 #: topic of a controller that takes the same type.
 _LINK = re.compile(r'/fogros2/\w+/link_(in|out)', re.ASCII)
@@ -109,10 +109,14 @@ class Link:
     def heard(self, message: Any, now: float) -> None:
         """Record a report of another stream."""
         report = claim_of(message)
-        if len(self._claims) == MOST_STREAMS:
-            self._claims.clear()  # those that are alive report again
-        if report is not None:
-            self._claims[report[0]] = now, report[1]
+        if report is None:
+            return
+        name, claim = report
+        if name not in self._claims and len(self._claims) >= MOST_STREAMS:
+            self._claims = {each: (when, other) for each, (when, other) in self._claims.items()
+                            if now - when < VALID}
+        if name in self._claims or len(self._claims) < MOST_STREAMS:
+            self._claims[name] = now, claim
 
     def share(self, name: str, claim: Claim, now: float) -> float:
         """Return the share of the stream ``name``; without free room, at most its floor."""

@@ -19,6 +19,7 @@ from image_transport_h264.sharing import (
     Link,
     links_of,
     LISTEN,
+    MOST_STREAMS,
     needed,
     PAYLOAD,
     VALID,
@@ -116,12 +117,31 @@ def test_shares_of_all_streams_stay_within_the_bandwidth() -> None:
     assert list(shares.values()) == pytest.approx([2e6] * 4)
 
 
+def test_bandwidth_holds_for_a_hundred_streams() -> None:
+    names = [f'stream {number}' for number in range(100)]
+    links = {name: Link(100e6, 0.0) for name in names}
+    shares: dict[str, float] = {}
+    for now in (0.0, 1.0, 2.0, 3.0):
+        for name in names:
+            shares[name] = links[name].share(name, wants(8e6), now)
+            reported = report(name, wants(8e6, shares[name]))
+            for other in names:
+                if other != name:
+                    links[other].heard(reported, now)
+    assert sum(shares.values()) <= PAYLOAD * 100e6 + 1
+    assert min(shares.values()) > 0.7e6
+
+
 def test_hostile_reports_are_bounded() -> None:
     link = Link(10e6, -LISTEN)
-    for number in range(10_000):
-        link.heard(report(f'stream {number}', wants(8e6, 8e6)), 0.0)
-    # at most 64 are counted, and the floor is left
+    hostile = dataclasses.replace(wants(8e6, 8e6), floor=0.0)
+    for number in range(2 * MOST_STREAMS):
+        link.heard(report(f'stream {number}', hostile), 0.0)
+    # the floor is left
     assert link.share('own', wants(8e6), 0.0) == 1e5
+    # those that are silent make room
+    link.heard(report('old', wants(8e6, 7e6)), VALID)
+    assert link.share('own', wants(8e6), VALID) == pytest.approx(1e6)
 
 
 @pytest.mark.parametrize(('labels', 'data'), [
