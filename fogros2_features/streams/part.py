@@ -25,6 +25,8 @@ class Part(LaunchPart):
     def __init__(self, launched: RunningLaunch) -> None:
         self._launch = launched
         self._streams = collection.Streams()
+        #: By machine: the entries that were added.
+        self._added: dict[str, list[StreamTopic]] = {}
         self._everywhere: list[tuple[Sequence[Entry], str]] = []
         #: By machine: the topic names that the first loaded components got.
         self._component_names: dict[str, dict[str, str]] = {}
@@ -43,10 +45,13 @@ class Part(LaunchPart):
 
     def resolve(self, items: Sequence[Entry], namespace: str) -> list[StreamTopic]:
         """Resolve entries."""
-        resolved = collection.resolve(
-            self._launch.context, items, namespace, self._launch.name_of)
+        resolved = self._resolved(items, namespace)
         collection.check(resolved)
         return resolved
+
+    def _resolved(self, items: Sequence[Entry], namespace: str) -> list[StreamTopic]:
+        return collection.resolve(
+            self._launch.context, items, namespace, self._launch.name_of)
 
     def beside(self, own: Sequence[StreamTopic], machine: Optional[str]) -> list[Program]:
         """Return the nodes that a process needs for streams and limits, and no earlier one did."""
@@ -72,10 +77,11 @@ class Part(LaunchPart):
         return [Program(spec, host, machine) for host, spec in policy.ends(machine)]
 
     def _all(self, own: Iterable[StreamTopic]) -> list[StreamTopic]:
-        return [*(entry for some in self._everywhere for entry in self.resolve(*some)), *own]
+        return [*(entry for some in self._everywhere for entry in self._resolved(*some)), *own]
 
     def _add(self, own: Iterable[StreamTopic], machine: str) -> list[Program]:
-        streams = self._all(own)
+        added = self._added.setdefault(machine, [])
+        streams = [entry for entry in self._all(own) if entry not in added]
         if not streams:
             return []
         machines = self._launch.machines
@@ -94,6 +100,7 @@ class Part(LaunchPart):
                     f"limit_topics of '{name}'", 'a stream already carries it')
             _refuse(names, self._launch.spec(name).features.get('share', {}).get('share', ()),
                     f"share= of '{name}'", 'a stream gives it another name there')
+        added += streams
         # another machine may be the source
         for name in machines:
             self._warn_of_early(name, before[name])
@@ -158,6 +165,7 @@ class Part(LaunchPart):
     def moved(self, machine: str) -> tuple[list[str], list[Program]]:
         """Let the robot take the machine's place in streams; its link has no limits any more."""
         ended, new, lost = self._streams.take_over(machine)
+        self._added.clear()
         ended += [node.id for host, node in self._policy(machine).ends(machine) if host is None]
         self._limited.discard(machine)
         if lost:

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -13,8 +15,9 @@ from launch.substitutions import LaunchConfiguration
 
 from fogros2 import StreamTopic
 from fogros2.errors import ConfigurationError
-from fogros2.model import NodeSpec
+from fogros2.model import MachineSpec, NodeSpec
 from fogros2_features.streams import collection
+from fogros2_features.streams.part import Part
 
 
 def test_nodes_are_handed_out_once() -> None:
@@ -68,6 +71,22 @@ def test_the_robot_stands_for_a_machine_that_is_taken_away() -> None:
     assert streams.take_over('gone') == ([], [], [])
     # its name has no stream left, so another launch of it would begin anew
     assert streams.remappings('gone') == {}
+
+
+def test_streams_of_the_description_are_converted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = MachineSpec('a', 'container')
+    launched: Any = SimpleNamespace(
+        context=LaunchContext(), spec=lambda name: machine, name_of=lambda source: source,
+        machines={'a': SimpleNamespace(interrupted=False, sent=[], renamed={})})
+    part = Part(launched)
+    part.everywhere([('/camera', 'h264')], '')
+    assert len(part.beside([], 'a')) == 2
+    convert = mock.Mock(wraps=collection.streams.stream)
+    monkeypatch.setattr(collection.streams, 'stream', convert)
+    assert part.beside([], 'a') == [] and convert.call_count == 0
+    # the robot takes the machine's place, and the machine comes back
+    part.moved('a')
+    assert [program.machine for program in part.beside([], 'a')] == [None]
 
 
 def test_stream_with_another_transport_is_not_reused() -> None:
