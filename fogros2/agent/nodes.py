@@ -226,6 +226,11 @@ class Nodes:
             self._run(node)
         return known
 
+    def clear(self) -> None:
+        """Forget all nodes, which have ended: another launch may use their ids."""
+        self.known.clear()
+        self.ended.clear()
+
     def stop(self, ids: Any) -> None:
         """
         Stop nodes, all of them if ``ids`` is None, as launch does: SIGINT, SIGTERM, SIGKILL.

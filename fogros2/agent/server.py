@@ -493,7 +493,7 @@ class Agent:
         if taken_over:
             self.claimed = ''
             self.adopted = True
-            self.nodes.known.clear()
+            self.nodes.clear()
             new.setdefault('heartbeat', None)
             self.config['notice'] = None
         self.released = self.released and not new.get('launch')

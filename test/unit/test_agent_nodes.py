@@ -233,3 +233,9 @@ def test_nodes_that_ended_long_ago_are_forgotten(
     assert [folder.exists() for folder in folders] == [True, True, True, False]
     assert [bool(node.spec) for node in started] == [False, False, True, False]
     assert nodes.start(started[:3]) == ['a', 'b', 'c']
+    # another launch uses an id again
+    nodes.clear()
+    nodes.start([Node({'id': number, 'name': 'n', 'arguments': ['true']}) for number in 'bxyz'])
+    for run in exits[-3:]:
+        run(0)
+    assert list(nodes.known) == ['b', 'y', 'z']
