@@ -11,6 +11,7 @@ import json
 import os
 from pathlib import Path
 import re
+import secrets
 import signal
 import subprocess
 import sys
@@ -641,16 +642,20 @@ def test_recording_and_viewer_have_streams_as_they_came(bench, tmp_path):
 
 
 def test_renamed_topic_is_recorded_and_missing_one_is_named(bench, tmp_path):
-    bench.node.create_publisher(String, '/fogros2/m/plan', LATCHED).publish(String(data='new'))
+    text = secrets.token_hex(1 << 20)  # the file gets a message of this size with the next one
+    publisher = bench.node.create_publisher(String, '/fogros2/m/plan', 1)
+    bench.node.create_timer(0.2, lambda: publisher.publish(String(data=text)))
     recorder = bench.run('-c', RECORD.format('recorder.PATIENCE = 1.0; '), str(tmp_path), '/plan',
                          '/none', '--ros-args', '-r', '/plan:=/fogros2/m/plan')
     bench.until(lambda: re.search('no topic of the names .*/none yet', ''.join(bench.lines)),
                 'the warning')
-    bench.listeners('/fogros2/m/plan', 1)
+    bench.until(lambda: any(path.stat().st_size > 1 << 19 for path in tmp_path.glob('*.mcap')),
+                'a message in the file')
     recorder.send_signal(signal.SIGINT)
     assert recorder.wait(60) == 0
     bench.processes.remove(recorder)
-    assert recorded(tmp_path) == {'/plan': ['new']}
+    got = recorded(tmp_path)
+    assert ([*got], {*got['/plan']}) == (['/plan'], {text})
 
 
 def test_recording_ends_before_the_disk_is_full(bench, tmp_path):

@@ -40,7 +40,7 @@ def test_an_announced_line_prints_its_process_first():
     assert second == f'{first} a b'
 
 
-@pytest.mark.parametrize('login', filter(shutil.which, ['sh', 'bash', 'tcsh', 'fish']))
+@pytest.mark.parametrize('login', [*filter(shutil.which, ['sh', 'bash', 'tcsh', 'fish'])])
 def test_any_login_shell_takes_scripts_of_several_lines(login):
     script = "read -r a\nprintf '%s!x\\\\%s\\n' $a \"$HOME's\"\n"
     line = command_line.marked_line(
