@@ -26,7 +26,7 @@ from fogros2.feature import Feature, RunningMachine
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.ros_names import check_name
 from fogros2.shell.command_line import remote_path
-from fogros2.shell.sync import used
+from fogros2.shell.sync import size_on_disk
 from fogros2.store import check_owner
 
 if TYPE_CHECKING:
@@ -183,10 +183,10 @@ def _copy(running: RunningMachine, folder: str, target: Path, limit: int) -> Non
             running.shell.fetch(folder, target, known=None, limit=limit, timeout=TIMEOUT)
             return
         except (ConnectError, DeadlineExceeded):
-            failures = 1 if used(target) > arrived else failures + 1
+            before, arrived = arrived, size_on_disk(target)
+            failures = 1 if arrived > before else failures + 1
             if failures == ATTEMPTS:
                 raise  # what has arrived stays
-            arrived = used(target)
 
 
 def _targets(home: Path, folders: Iterable[str]) -> dict[str, Path]:

@@ -79,7 +79,7 @@ _REACHABLE = ('', 'DEFAULT', 'UDPV4')
 #: not matter, and what follows from others.
 _REFUSED: Sequence[tuple[str, Sequence[str], str]] = (
     ('userTransports/transport_id', (), 'exclude the VPN'),
-    ('useBuiltinTransports', ('true',), 'exclude the VPN'),
+    ('useBuiltinTransports', ('true', '1'), 'exclude the VPN'),
     ('builtinTransports', ('DEFAULT', 'UDPv4'), 'have no plain UDP, which machines use'),
     ('builtin/discovery_config/discoveryProtocol', ('SIMPLE',),
      'discover by a server that no machine knows'),
@@ -87,7 +87,7 @@ _REFUSED: Sequence[tuple[str, Sequence[str], str]] = (
      'ignore other hosts'),
     ('builtin/metatrafficUnicastLocatorList//address', (), 'have no address in the VPN'),
     ('defaultUnicastLocatorList//address', (), 'have no address in the VPN'),
-    ('port/portBase', (), 'have other ports than those of machines'))
+    ('port/portBase', ('7400',), 'have other ports than those of machines'))
 _PEER = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
 _UDP = 'fogros2_udp'
 

@@ -171,7 +171,7 @@ class Room(Stall):
     """
     Raises an error, too, if a folder becomes too large.
 
-    :param limit: bytes on the disk, see ``used``.
+    :param limit: bytes on the disk, see ``size_on_disk``.
     :param message: of the error.
     """
 
@@ -196,7 +196,7 @@ class Room(Stall):
 
         :raises ShellError: it is too large.
         """
-        begin, size = time.monotonic(), used(self._folder)
+        begin, size = time.monotonic(), size_on_disk(self._folder)
         if size > self._limit:
             raise ShellError(self._message, 'the machine may be hijacked: delete it')
         self.note(size)
@@ -204,7 +204,7 @@ class Room(Stall):
         self._next = time.monotonic() + max(0.1, 10 * (time.monotonic() - begin))
 
 
-def used(folder: Path) -> int:
+def size_on_disk(folder: Path) -> int:
     """
     Return the bytes on the disk of what is in a folder.
 

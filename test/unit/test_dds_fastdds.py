@@ -230,9 +230,9 @@ def test_participant_that_meets_no_machine_is_refused(
         robot(FastDds(), default_participant(tmp_path / 'own.xml', rtps))
     assert caught.value.hint
     robot(FastDds(), default_participant(
-        tmp_path / 'own.xml', '<useBuiltinTransports>true</useBuiltinTransports><builtin>'
-        '<discovery_config><discoveryProtocol>SIMPLE</discoveryProtocol></discovery_config>'
-        '</builtin>'))
+        tmp_path / 'own.xml', '<useBuiltinTransports>1</useBuiltinTransports><port><portBase>'
+        '7400</portBase></port><builtin><discovery_config><discoveryProtocol>SIMPLE'
+        '</discoveryProtocol></discovery_config></builtin>'))
 
 
 @pytest.mark.parametrize(('name', 'value'), [

@@ -189,7 +189,7 @@ class Enough(threading.Event):
         self.folder, self.enough = folder, enough
 
     def is_set(self) -> bool:
-        return sync.used(self.folder) >= self.enough
+        return sync.size_on_disk(self.folder) >= self.enough
 
 
 def test_fetch_continues_a_file_that_was_cut_off(shell, tmp_path, monkeypatch):
