@@ -88,8 +88,8 @@ def check_sudo(*, ask: bool = False) -> None:
         trouble = process.sudo_trouble()
     if trouble is not None:
         reason, remedy = trouble
-        helper = f'put you into the group {helped.GROUP}' if Path(helped.HELPER).exists() \
-            else 'install the helper (doc/install.md)'
+        helper = f'put you into the group {helped.GROUP}, or install the helper again after an ' \
+            'update' if Path(helped.HELPER).exists() else 'install the helper (doc/install.md)'
         raise PrerequisiteError(f'a VPN interface needs root, and {reason}',
                                 f'{remedy}, or have an administrator {helper}')
 

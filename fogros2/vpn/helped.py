@@ -25,7 +25,7 @@ HELPER = '/usr/libexec/fogros2/vpn'
 #: The group whose members may use the helper.
 GROUP = 'fogros2'
 #: The helper's answer to ``check`` if its protocol is the one of this module.
-PROTOCOL = '4'
+PROTOCOL = '5'
 #: Folder of the helper's private keys, one subfolder per interface; the user cannot read them.
 KEYS = '/run/fogros2-vpn'
 

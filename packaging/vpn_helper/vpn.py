@@ -44,8 +44,8 @@ from fogros2.model import Command, Peer, VpnInterface  # noqa: E402
 from fogros2.vpn import addresses  # noqa: E402
 from fogros2.vpn.wireguard import WireGuard  # noqa: E402
 
-#: What both sides mean by the words and fields below.
-PROTOCOL = 4
+#: What both sides mean by the words and fields below. Other fields need another number.
+PROTOCOL = 5
 #: One folder for each interface: its key, and whose it is. Gone at boot, as interfaces are. Not
 #: where agents are: a robot may be a machine, too.
 RECORDS = Path('/run/fogros2-vpn')
