@@ -252,9 +252,11 @@ class Record:
 
 
 def load(folder: Path) -> Record:
-    """Return what was written of an interface."""
-    fields = json.loads((folder / 'record').read_text())
-    fields['ports'] = tuple((first, last) for first, last in fields['ports'])
+    """Return what was written of an interface, by this or another version."""
+    written = json.loads((folder / 'record').read_text())
+    fields = {field.name: written[field.name] for field in dataclasses.fields(Record)
+              if field.name in written}
+    fields['ports'] = tuple((first, last) for first, last in fields.get('ports', ()))
     fields['asked'] = tuple(fields.get('asked', ()))
     return Record(**fields)
 

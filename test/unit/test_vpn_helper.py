@@ -165,6 +165,17 @@ def test_port_may_change_and_address_may_not(
     assert len(ran) == 3
 
 
+@pytest.mark.parametrize('change', [
+    lambda fields: {**fields, 'domain': 7},
+    lambda fields: {key: value for key, value in fields.items() if key != 'asked'}])
+def test_record_of_another_version_is_read(tmp_path: Path, change: Any) -> None:
+    record = vpn.Record('fog0a1b2c', 1000, 0, 0, NETWORK, '198.18.7.1', 51820, ((7400, 7649),))
+    record.save(tmp_path)
+    file = tmp_path / 'record'
+    file.write_text(json.dumps(change(json.loads(file.read_text()))))
+    assert vpn.load(tmp_path) == record
+
+
 def test_deep_nesting_is_refused() -> None:
     with pytest.raises(vpn.Refused, match='no JSON'):
         vpn.parse('down', b'[' * 100_000)
