@@ -453,7 +453,9 @@ def _digits(folder: Path, *, new: bool) -> str:
         file.seek(0)
         try:
             known: dict[str, str] = dict(json.load(file))
-        except (ValueError, TypeError):
+            if 'digits' in known:  # an older version's, of one computer
+                known.setdefault(f"{known['machine_id']} {known['mac']}", known['digits'])
+        except (ValueError, TypeError, LookupError):
             known = {}
         computers = [f'{machine_id} {address}' for address in addresses or ['']]
         for computer in computers:

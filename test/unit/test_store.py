@@ -3,6 +3,7 @@
 
 import contextlib
 import errno
+import json
 import os
 from pathlib import Path
 import re
@@ -264,6 +265,18 @@ def test_computers_with_one_home_keep_their_ids(monkeypatch, tmp_path):
         monkeypatch.setattr(store_module, 'mac_addresses', lambda end=end: [f'02::{end}'])
         ids.append(robot_id())
     assert ids[0] == ids[2] != ids[1]
+
+
+def test_id_of_an_older_version_stays(monkeypatch, tmp_path):
+    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
+    robot_id()
+    file = tmp_path / 'fogros2/robot.json'
+    ((computer, _),) = json.loads(file.read_text()).items()
+    machine_id, _, mac = computer.partition(' ')
+    file.write_text(json.dumps({'digits': '0123abcd', 'machine_id': machine_id, 'mac': mac}))
+    assert robot_id(new=False) == robot_id() == f'{robot_name()}-0123abcd'
+    monkeypatch.setattr(store_module, 'mac_addresses', lambda: ['02::b'])  # a copy of the file
+    assert robot_id(new=False) == robot_name() and '0123abcd' not in robot_id()
 
 
 def test_volume_of_the_docker_command_keeps_id_and_state(monkeypatch):
