@@ -310,7 +310,8 @@ def plan(
             mode in ('auto', 'none')
             or mode == 'apt' and _builds(facts)):
         todo = _ros(facts, wheels, chain)
-    elif (mode != 'apt' and wheels.ros and wheels.key in facts.installed
+    elif (mode != 'apt' and wheels.ros
+            and os.path.basename(_pip_folder(facts, wheels)) in facts.installed
             and under.rmw == DEFAULT_RMW and python_only):
         todo = Preparation('none', _pip_install(facts, wheels))
     elif mode == 'none':
@@ -497,12 +498,21 @@ def _folder(facts: HostFacts, wheels: wheel_cache.Wheels) -> str:
 
 
 def _pip_python(facts: HostFacts, wheels: wheel_cache.Wheels) -> Python:
-    return _fits(facts, wheels) or next(
-        p for p in facts.pythons if p.venv and MIN_PYTHON <= p.version <= MAX_PYTHON)
+    python = _fits(facts, wheels) or next(
+        (p for p in facts.pythons if p.venv and MIN_PYTHON <= p.version <= MAX_PYTHON),
+        facts.python)
+    assert python is not None
+    return python
+
+
+def _pip_folder(facts: HostFacts, wheels: wheel_cache.Wheels) -> str:
+    """Return the folder of a virtual environment: another version of Python needs another one."""
+    major, minor = _pip_python(facts, wheels).version
+    return f'{_folder(facts, wheels)}-{major}.{minor}'
 
 
 def _pip_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
-    prefix = f'{_folder(facts, wheels)}/venv'
+    prefix = f'{_pip_folder(facts, wheels)}/venv'
     return RosInstall('pip', environment={
         'PATH': f'{prefix}/bin:{SYSTEM_PATH}', 'AMENT_PREFIX_PATH': prefix,
         'VIRTUAL_ENV': prefix})
@@ -511,7 +521,7 @@ def _pip_install(facts: HostFacts, wheels: wheel_cache.Wheels) -> RosInstall:
 def _pip(facts: HostFacts, wheels: wheel_cache.Wheels) -> Preparation:
     """Return the plan that installs the sent wheels into a virtual environment."""
     return Preparation(
-        'pip', _pip_install(facts, wheels), wheels_target=f'{_folder(facts, wheels)}/wheels',
+        'pip', _pip_install(facts, wheels), wheels_target=f'{_pip_folder(facts, wheels)}/wheels',
         commands=(_install_wheels(facts, wheels),))
 
 
@@ -524,7 +534,7 @@ def _install_wheels(
     :param fetched: SHA-256 of the wheels that the robot has fetched and sent for this machine; it
         then asks no index.
     """
-    folder = _folder(facts, wheels)
+    folder = _pip_folder(facts, wheels)
     target, python = f'{folder}/wheels', _pip_python(facts, wheels)
     # pip runs from its wheel, so that the machine needs no ensurepip (package python3-venv).
     words = [f'{target}/{wheels.pip}/pip', 'install', '--quiet', '--no-compile',
@@ -546,7 +556,8 @@ def _install_wheels(
         f'{installer.ENTER.format(folder=shlex.quote(folder))}'
         f'{_checked(wheels, wheels.pip)}'
         'rm -rf venv\n'
-        f'{shlex.quote(python.path)} -m venv --without-pip venv\n'
+        # an upgrade changes python3, and not python3.12
+        f'"$(readlink -f {shlex.quote(python.path)})" -m venv --without-pip venv\n'
         f"printf '%s\\n' {shlex.join(lines)} >requirements.txt\n"
         f'venv/bin/python {shlex.join(words)} --requirement requirements.txt\n'
         # the robot's own are relocated already

@@ -117,7 +117,7 @@ class HostFacts:
     :param routes: IPv4 networks with a route, in CIDR form or as addresses.
     :param network: identifies the network of its processes, '' if unknown: the boot id of the
         kernel and the network namespace.
-    :param installed: keys of wheels that earlier launches have installed completely.
+    :param installed: folders that earlier launches have installed completely.
     :param environments: by requested prefix that exists and works, a signature of its packages.
     :param fogros2: whether one of them has this package.
     """

@@ -80,7 +80,7 @@ def test_ros_is_installed_without_a_network(
                    'PIP_INDEX_URL': 'http://127.0.0.1:9/'}
     for command in todo.commands:
         subprocess.run([*offline, *command.argv], check=True, env=environment)
-    python = f'{tmp_path}/.local/share/fogros2/{packed.key}/venv/bin/python'
+    python = f'{target.parent}/venv/bin/python'
     said = subprocess.run(
         [python, '-c', 'import fogros2, rclpy, launch, std_msgs.msg as m; rclpy.init(); '
          'node = rclpy.create_node("n"); node.create_publisher(m.String, "t", 1); '
@@ -91,7 +91,7 @@ def test_ros_is_installed_without_a_network(
     assert subprocess.run([ros2, 'fog', '-h'], check=True, capture_output=True, text=True,
                           env=environment).stdout
     # the next launch sees it and has nothing to do
-    facts = dataclasses.replace(facts, installed=frozenset({packed.key}))
+    facts = dataclasses.replace(facts, installed=frozenset({target.parent.name}))
     assert bootstrap.plan(spec, facts, facts, UNDER, packed).commands == ()
 
 

