@@ -314,16 +314,16 @@ prepare() {
     old_needs= old_sources= old_extras=
     [ ! -f "$stamp" ] || read -r old_needs old_sources old_extras <"$stamp" || :
     if [ "$old_needs $old_sources" = "$needs $sources" ] && enough "$old_extras" \
-            && "$folder/bin/python" -c ''; then
+            && "$folder/bin/python" -c 'import pip' 2>/dev/null; then
         return 0
     fi
     rm -f "$stamp"
     copy_sources
     if enough "$old_extras"; then now=$old_extras; else now=$extras; fi
     if [ "$old_needs" != "$needs" ] || [ "$old_extras" != "$now" ] \
-            || ! "$folder/bin/python" -c '' 2>/dev/null; then
+            || ! "$folder/bin/python" -c 'import pip' 2>/dev/null; then
         extras=$now
-        if [ -x "$folder/bin/python" ] && "$folder/bin/python" -c '' 2>/dev/null; then
+        if [ -x "$folder/bin/python" ] && "$folder/bin/python" -c 'import pip' 2>/dev/null; then
             say "Adding what 'make $target' needs to ${folder#"$PWD"/}"
         else
             say "Making the virtual environment ${folder#"$PWD"/} ($what," \

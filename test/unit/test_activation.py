@@ -104,6 +104,25 @@ def test_each_package_may_have_a_prefix_of_its_own(project: Path) -> None:
     assert done.stdout == f'{install}/setup.sh\n'
 
 
+def test_environment_of_a_former_python_is_made_again(project: Path, venv: Path) -> None:
+    (venv / '.fogros2-stamp').write_text('needs sources none\n')
+    script = ('. tools/common.sh; extras=none target=demo; needs_hash() { echo needs; }; '
+              'sources_hash() { echo sources; }; enough() { :; }; copy_sources() { :; }; '
+              'install_ros() { :; }; pip_in() { :; }; '
+              'eval "$(sed -n "/^prepare() {/,/^}/p" tools/setup.sh)"; '
+              'prepare "$1" echo "" ROS')
+
+    def prepared() -> str:
+        return subprocess.run(['sh', '-euc', script, 'sh', str(venv)], cwd=project, check=True,
+                              text=True, capture_output=True).stdout
+
+    # the Python of now finds nothing of what is installed
+    assert f'-m venv --clear {venv}\n' in prepared()
+    (site,) = venv.glob('lib/python3*/site-packages')
+    (site / 'pip.py').touch()
+    assert prepared() == ''
+
+
 @pytest.mark.parametrize(('interpreter', 'message'), [
     ('nowhere', 'FOGROS2_PYTHON names no program: nowhere'),
     ('too-old', 'FOGROS2_PYTHON names no Python 3.10 or newer: too-old')])
