@@ -14,7 +14,6 @@ import re
 import time
 from typing import Optional
 
-from fogros2 import shell as shells
 from fogros2.agent_client import AgentClient
 from fogros2.deploy import undo
 from fogros2.deploy.robot import clear
@@ -84,7 +83,7 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
         if entry.machine is not None:
             if entry.record is not None:
                 if not entry.machine.owned:
-                    _leave(entry.record, entry.machine, force=force)
+                    _leave(entry, entry.record, entry.machine, force=force)
                 elif not force:
                     _check_unused(entry, entry.record)
             _destroy(entry.machine)
@@ -251,26 +250,24 @@ class _Left(undo.Site):
                 client.request('release', on_exit='delete', exit=True, timeout=30.0)
 
 
-def _leave(record: Record, machine: Machine, *, force: bool) -> None:
+def _leave(entry: Entry, record: Record, machine: Machine, *, force: bool) -> None:
     """Undo what a launch has made on a computer that FogROS2 does not own."""
-    if record.endpoint is None:
+    if record.endpoint is None and not record.made:
         return
     account = machines.load(record.provider).capabilities.account
-    shell = shells.connect(record.endpoint, name=record.name, timeout=10.0)
     try:
-        with _agent(record, shell) as client, contextlib.suppress(AgentError):
-            if client is not None:
-                launch = client.status()['launch']
-                if launch not in ('', record.launch, record.last):
-                    return  # our agent is gone, and another robot uses the computer now
-                if not force and not _sure(record) and _hears_launch(client):
-                    raise _used(record)
-        undo.unmake_all(_Left(record, machine, shell), record.made)
+        with reach.session(entry, timeout=10.0) as shell:
+            with _agent(record, shell) as client, contextlib.suppress(AgentError):
+                if client is not None:
+                    launch = client.status()['launch']
+                    if launch not in ('', record.launch, record.last):
+                        return  # our agent is gone, and another robot uses the computer now
+                    if not force and not _sure(record) and _hears_launch(client):
+                        raise _used(record)
+            undo.unmake_all(_Left(record, machine, shell), record.made)
     except (ShellError, DeadlineExceeded):
         if not force and not account:  # another robot may have taken the account away
             raise
-    finally:
-        shell.close()
 
 
 @dataclasses.dataclass(frozen=True)

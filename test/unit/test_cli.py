@@ -126,7 +126,7 @@ def dead() -> dict[str, int]:
 
 def lab(monkeypatch: pytest.MonkeyPatch, shell: FakeShell, **changes: Any) -> None:
     """Let a dead launch have used a host that answers by a shell."""
-    monkeypatch.setattr(endings.shells, 'connect', lambda *_, **__: shell)
+    monkeypatch.setattr(endings.reach.shells, 'connect', lambda *_, **__: shell)
     made = machine('lab', provider='untagged', owned=False)
     record('lab', **{
         'provider': 'untagged', 'endpoint': made.endpoint, 'agent': '/run/fogros2/lab',
@@ -591,6 +591,21 @@ def test_delete_undoes_what_a_launch_has_made_on_a_host(
     down, = (c for c in shell.commands if 'VPN' in c.what)
     assert down == next(WireGuard().down(LAB_VPN)), 'not left to guests'
     assert Store().exists('lab') == fails
+
+
+@pytest.mark.parametrize(('words', 'answers', 'forgotten'), [
+    ((), True, True), ((), False, False), (('--force',), False, True)])
+def test_delete_asks_the_provider_where_a_host_is(
+    monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], answers: bool, forgotten: bool,
+) -> None:
+    shell = FakeShell(handlers={
+        'test': lambda c: Result(1, '', ''), 'sh': lambda c: Result(0, '', '')})
+    lab(monkeypatch, shell, endpoint=None, made=(Made(undo.WATCHDOG),))
+    if not answers:
+        machine('lab', provider='untagged', owned=False, endpoint=None, state=MachineState.STOPPED)
+    assert run('delete', 'lab', '--yes', *words) == int(not forgotten)
+    assert any(c.what == 'remove the agent' for c in shell.commands) == answers
+    assert Store().exists('lab') != forgotten
 
 
 def test_gc_closes_the_ports_of_a_kept_machines_launch(
