@@ -170,9 +170,10 @@ def unmake(site: Site, made: Made) -> bool:
     """
     if made.kind in _UNDO:
         return _UNDO[made.kind](site, made) == STAYS
-    if made.kind not in plugin_system.names(feature.GROUP):  # of another version's launch
+    if made.kind not in plugin_system.names(feature.GROUP):
         raise StoreError(f"the record of '{site.record.name}' has '{made.kind}', which this "
-                         "version can't undo", 'undo it with the version that made it')
+                         "version can't undo", 'install the plugin again, or the version that '
+                         'made it; `ros2 fog delete --force` forgets it')
     site.clean_up(feature.load(made.kind).clean_up(site.record.last))
     return False
 

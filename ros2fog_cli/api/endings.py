@@ -265,8 +265,10 @@ def _leave(entry: Entry, record: Record, machine: Machine, *, force: bool) -> No
                     if not force and not _sure(record) and _hears_launch(client):
                         raise _used(record)
             undo.unmake_all(_Left(record, machine, shell), record.made)
-    except (ShellError, DeadlineExceeded):
-        if not force and not account:  # another robot may have taken the account away
+    except FogError as error:
+        # another robot may have taken the account away
+        taken = account and isinstance(error, (ShellError, DeadlineExceeded))
+        if not force and not taken:
             raise
 
 

@@ -608,6 +608,18 @@ def test_delete_asks_the_provider_where_a_host_is(
     assert Store().exists('lab') != forgotten
 
 
+def test_force_forgets_what_a_removed_feature_has_made(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    shell = FakeShell(handlers={
+        'test': lambda c: Result(1, '', ''), 'sh': lambda c: Result(0, '', '')})
+    lab(monkeypatch, shell, made=(Made(undo.WATCHDOG), Made('shelf')))
+    assert run('delete', 'lab', '--yes') == 1
+    assert 'install the plugin again' in capsys.readouterr().err and Store().exists('lab')
+    assert run('delete', 'lab', '--yes', '--force') == 0 and not Store().exists('lab')
+    assert shell.commands[-1].what == 'remove the agent'  # the others are undone
+
+
 def test_gc_closes_the_ports_of_a_kept_machines_launch(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
