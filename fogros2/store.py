@@ -23,7 +23,7 @@ import shutil
 import tempfile
 import threading
 import time
-from typing import Any, Optional
+from typing import Any, Optional, TYPE_CHECKING, TypeVar
 
 from fogros2 import model, process
 from fogros2.errors import (
@@ -35,6 +35,11 @@ from fogros2.errors import (
     StoreError,
 )
 from fogros2.model import Command, Endpoint, MachineSpec, OtherVpn, Peer, VpnInterface
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    T = TypeVar('T', bound=DataclassInstance)
 
 #: Name of a file or folder that only one process uses, with that process.
 _UNFINISHED = re.compile(r'\..+\.([0-9]+)\.[a-z0-9_]{8}')
@@ -277,7 +282,7 @@ class Store:
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise StoreError(
                 f'{path} is damaged: {error}',
-                f'ros2 fog delete {name} finds the machine by its tags') from error
+                f'ros2 fog delete {name} finds the machine by its tags, if it has any') from error
 
     def save(self, record: Record) -> Record:
         """Replace a machine's record on disk, and return it."""
@@ -608,23 +613,28 @@ def other_vpn(folder: Path) -> Optional[OtherVpn]:
     """Return the VPN of another robot that a folder belongs to, None if it belongs to none."""
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
         data = json.loads((folder / OTHER_VPN).read_text())
-        return OtherVpn(Peer(**data['machine']), VpnInterface(**data['interface']),
-                        VpnInterface(**data['own']), data['heartbeats'])
+        return OtherVpn(
+            _known(Peer, data['machine']), _known(VpnInterface, data['interface']),
+            _known(VpnInterface, data['own']), data['heartbeats'])
     return None
 
 
 def record_from_json(data: Mapping[str, Any]) -> Record:
-    """Read a Record that ``model.to_json`` wrote; ignore unknown keys of later versions."""
-    names = {f.name for f in dataclasses.fields(Record)}
-    values = {key: value for key, value in data.items() if key in names}
-    fields = {f.name for f in dataclasses.fields(MachineSpec)}
-    spec: dict[str, Any] = {k: v for k, v in values['spec'].items() if k in fields}
+    """Read a Record that ``model.to_json`` wrote."""
+    values, spec = dict(data), dict(data['spec'])
     for key in ('underlays', 'apt', 'pip'):
-        spec[key] = tuple(spec[key])
-    values['spec'] = MachineSpec(**spec)
+        spec[key] = tuple(spec.get(key, ()))
+    values['spec'] = _known(MachineSpec, spec)
     for key, kind in (('endpoint', Endpoint), ('vpn', VpnInterface), ('robot_vpn', VpnInterface)):
         if values.get(key) is not None:
-            values[key] = kind(**values[key])
-    values['made'] = tuple(Made(**each) for each in values.get('made', ()))
+            values[key] = _known(kind, values[key])
+    values['made'] = tuple(_known(Made, each) for each in values.get('made', ()))
     values['owners'] = tuple(values.get('owners', ()))
-    return Record(**values)
+    values['asked'] = values.get('asked') or {}
+    return _known(Record, values)
+
+
+def _known(kind: type[T], data: Mapping[str, Any]) -> T:
+    """Make a dataclass of JSON values; ignore unknown keys of later versions."""
+    names = {field.name for field in dataclasses.fields(kind)}
+    return kind(**{key: value for key, value in data.items() if key in names})

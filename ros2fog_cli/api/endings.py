@@ -26,6 +26,7 @@ from fogros2.errors import (
     NameTaken,
     ProviderError,
     ShellError,
+    StoreError,
 )
 from fogros2.model import Command, Machine, MachineState
 from fogros2.provider import Provider
@@ -91,6 +92,11 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
         if record is None:
             return
         if record.damage:
+            if entry.machine is None and not force:
+                raise StoreError(
+                    f"the record of '{record.name}' can't be read, and no provider knows it",
+                    'the version that wrote the record reads it; --force forgets the machine, and '
+                    'leaves what is on an SSH host')
             store.delete(record.name)
             return
         # The machine deleted itself, or was never created; its resources may still exist.

@@ -158,8 +158,8 @@ def test_damaged_record_is_reported(cloud_network):
         error, _ = fails('container', network=cloud_network)
         assert f'{folder}/record.json is damaged' in error
         assert f'ros2 fog delete {NAME}' in error
-        deleted = subprocess.run(['ros2', 'fog', 'delete', NAME, '--yes'], capture_output=True,
-                                 text=True, timeout=60)
+        deleted = subprocess.run(['ros2', 'fog', 'delete', NAME, '--yes', '--force'],
+                                 capture_output=True, text=True, timeout=60)
         assert deleted.returncode == 0, deleted.stderr
     finally:
         with contextlib.suppress(FileNotFoundError):

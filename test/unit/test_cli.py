@@ -423,6 +423,18 @@ def test_delete_works_with_a_damaged_record() -> None:
     assert not Memory.machines and not folder.exists()
 
 
+def test_unreadable_record_without_a_machine_needs_force(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A computer of the user has no tags by which it could be found."""
+    folder = Store().machine('lab')
+    folder.mkdir(parents=True)
+    (folder / 'record.json').write_text('{}')
+    assert run('delete', 'lab', '-y') == 1 and folder.exists()
+    assert '--force' in capsys.readouterr().err
+    assert run('delete', 'lab', '-y', '--force') == 0 and not folder.exists()
+
+
 @pytest.mark.parametrize(('name', 'own', 'others'), [
     ('all', ['a', 'b'], ['--any-robot']),
     ('c', ['c'], [])])  # from any computer, where none of that name is its own

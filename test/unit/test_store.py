@@ -3,7 +3,9 @@
 
 import contextlib
 import errno
+import functools
 import json
+import operator
 import os
 from pathlib import Path
 import re
@@ -17,10 +19,11 @@ import pytest
 
 from fogros2 import store as store_module
 from fogros2.errors import Cancelled, ConfigurationError, NameTaken, StoreError
-from fogros2.model import Endpoint, MachineSpec, VpnInterface
+from fogros2.model import Endpoint, MachineSpec, OtherVpn, Peer, to_json, VpnInterface
 from fogros2.store import (
     boot_id,
     is_another_robot,
+    Made,
     process_alive,
     process_start,
     Record,
@@ -76,11 +79,37 @@ def test_damaged_record_is_listed_and_loads_with_a_hint(store, content):
     assert 'damaged' in store.machines()[0].damage
 
 
-def test_unknown_keys_of_a_later_version_are_left_aside(store):
+@pytest.mark.parametrize('place', [
+    (), ('spec',), ('endpoint',), ('vpn',), ('robot_vpn',), ('made', 0)])
+def test_unknown_keys_of_a_later_version_are_left_aside(store, place):
+    vpn = VpnInterface('fog1m0', '198.18.0.2', '198.18.0.0/24', 50000, '/run/k')
+    saved = store.save(record(
+        endpoint=Endpoint('ssh', '198.51.100.7'), vpn=vpn, robot_vpn=vpn, made=(Made('VPN'),)))
+    path = store.machine('planner') / 'record.json'
+    data = json.loads(path.read_text())
+    functools.reduce(operator.getitem, place, data)['from_the_future'] = 1
+    path.write_text(json.dumps(data))
+    assert store.load('planner') == saved
+
+
+def test_vpn_of_a_later_version_is_read(tmp_path):
+    vpn = VpnInterface('fog1', '198.18.0.2', '198.18.0.0/24', 50000, '/run/k')
+    other = OtherVpn(Peer('a', 'key', '198.18.0.3'), vpn, vpn, 5000)
+    data = json.loads(to_json(other))
+    for place in ('machine', 'interface', 'own'):
+        data[place]['from_the_future'] = 1
+    (tmp_path / store_module.OTHER_VPN).write_text(json.dumps(data))
+    assert store_module.other_vpn(tmp_path) == other
+
+
+def test_missing_values_of_an_earlier_version_are_empty(store):
     store.save(record())
     path = store.machine('planner') / 'record.json'
-    path.write_text(path.read_text().replace('{', '{"from_the_future": 1,', 1))
-    assert store.load('planner') == record()
+    data = json.loads(path.read_text())
+    for key in ('underlays', 'apt', 'pip'):
+        del data['spec'][key]
+    path.write_text(json.dumps({**data, 'asked': None}))
+    assert store.load('planner').spec.apt == () and store.load('planner').asked == {}
 
 
 def test_a_name_is_held_by_one_at_a_time(store):
