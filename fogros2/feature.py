@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 from decimal import Decimal
+import inspect
 from pathlib import Path
 import threading
 from typing import Any, ClassVar, Optional, Protocol, TYPE_CHECKING
 
 from fogros2 import plugin_system
+from fogros2.errors import ConfigurationError
 from fogros2.model import (
     Command,
     CreateRequest,
@@ -547,9 +549,13 @@ def options(name: str, given: Mapping[str, Any], of: str = 'options') -> Any:
     Return a feature's options from the values of its keywords.
 
     :param of: ``options``, or ``node_options``.
-    :raises ConfigurationError: a value is wrong.
+    :raises ConfigurationError: a value is wrong, or this version has no such keyword.
     """
-    return getattr(plugin_system.load(GROUP, name), of)(**given)
+    make = getattr(plugin_system.load(GROUP, name), of)
+    for keyword in given.keys() - inspect.signature(make).parameters:
+        raise ConfigurationError(f"the installed feature '{name}' has no keyword '{keyword}'",
+                                 'install the version that has it')
+    return make(**given)
 
 
 def contained(given: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -209,6 +209,14 @@ def test_a_feature_that_is_not_installed_is_one_error(check: Callable[..., None]
         check(gone={})
 
 
+def test_keyword_of_another_version_is_one_error(
+    check: Callable[..., None], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    instead(monkeypatch, 'fogros2.feature', {'counting': Counting})
+    with pytest.raises(ConfigurationError, match="'counting' has no keyword 'grace'"):
+        check(counting={'count': 3, 'grace': 1})
+
+
 # -- results -------------------------------------------------------------------------------------
 
 
