@@ -58,11 +58,14 @@ def load(group: str, name: str) -> Any:
         return points[name].load()
     except ImportError as error:
         module = error.name or name
-        ours = module.partition('.')[0] in own_packages()
+        remedy = f'python3 -m pip install {module}'
+        if module.partition('.')[0] in own_packages():
+            dist = points[name].dist
+            remedy = 'install FogROS2 again from the folder that it came from' \
+                if dist is None or dist.name == 'fogros2' else \
+                f'install a version of {dist.name} that is for this version of FogROS2'
         raise PrerequisiteError(
-            f"the {_kind(group)} '{name}' can't be loaded: {error}",
-            'install FogROS2 again from the folder that it came from' if ours else
-            f'python3 -m pip install {module}') from error
+            f"the {_kind(group)} '{name}' can't be loaded: {error}", remedy) from error
 
 
 def _kind(group: str) -> str:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests of the small modules below everything: errors, waiting, report, plugins, process."""
 
+from importlib import metadata
 import json
 import os
 import sys
@@ -12,6 +13,7 @@ import pytest
 from fogros2 import errors, model, plugin_system, process, report
 from fogros2.model import Command, NodeSpec, Result
 from fogros2.waiting import wait_until
+from fogros2_testing.plugins import install
 
 
 def test_error_has_message_and_hint():
@@ -61,6 +63,17 @@ def test_step_is_reported_with_detail_and_failure():
 def test_unknown_plugin_is_refused_with_a_suggestion():
     with pytest.raises(errors.ConfigurationError, match="did you mean 'container'"):
         plugin_system.load('fogros2.provider', 'conteiner')
+
+
+def test_plugin_for_another_version_is_named(tmp_path, monkeypatch):
+    install(tmp_path, 'fogros2.feature', 'shelf', 'import fogros2.transport', 'Shelf')
+    monkeypatch.syspath_prepend(tmp_path)
+    (found,) = metadata.distributions(path=[str(tmp_path)])
+    monkeypatch.setattr(
+        plugin_system, '_entry_points', lambda group: {p.name: p for p in found.entry_points})
+    with pytest.raises(errors.PrerequisiteError, match='fogros2.transport') as caught:
+        plugin_system.load('fogros2.feature', 'shelf')
+    assert 'fogt_shelf' in caught.value.hint and 'install FogROS2' not in caught.value.hint
 
 
 def test_json_of_the_model_is_plain():
