@@ -636,7 +636,9 @@ class Agent:
 
     def _watch(self) -> None:
         """Stop the nodes or end the machine when a deadline of the watchdog has passed."""
-        reason = self.watchdog.due(self.loop.clock())
+        now = self.loop.clock()
+        self.watchdog.check_suspend(now - time.monotonic(), now)
+        reason = self.watchdog.due(now)
         if reason is None:
             return
         # 'no launch came' ends a machine whose first launch died, but not an adopted machine

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import math
 import selectors
 import socket
 import time
@@ -35,6 +36,8 @@ class Watchdog:
         self.beat_at: Optional[float] = None
         #: The number of the last heartbeat.
         self.number = 0
+        #: Seconds since boot for which this computer was suspended, at the last check.
+        self.suspended = math.inf
 
     @property
     def state(self) -> list[Any]:
@@ -67,6 +70,13 @@ class Watchdog:
         self.number = number
         if self.beat_at is not None:
             self.beat_at = now
+
+    def check_suspend(self, suspended: float, now: float) -> None:
+        """Wait anew for the launch after a suspend, in which no heartbeat could arrive."""
+        if suspended - self.suspended > 1.0:
+            self.boot_from = None if self.boot_from is None else now
+            self.beat_at = None if self.beat_at is None else now
+        self.suspended = suspended
 
     def disarm(self) -> None:
         """Expect no heartbeat: the launch has ended or is known to be gone; keep the lifetime."""

@@ -14,8 +14,9 @@ import pytest
 
 from fogros2.agent import journal
 from fogros2.agent.journal import Journal
-from fogros2.agent.loop import Loop
+from fogros2.agent.loop import boot_clock, Loop
 from fogros2.agent.protocol import checked, CONFIG, Refused
+from fogros2.agent.server import Agent
 from fogros2.agent.watchdog import Heartbeats, Watchdog
 
 HEARTBEAT = {'bind': '10.0.0.1', 'peer': '10.0.0.2', 'port': 7, 'key': 'ab' * 16}
@@ -213,6 +214,22 @@ def test_lifetime_ends_machine_despite_heartbeats():
     dog.disarm()
     assert dog.due(1999.9) is None
     assert dog.due(2000.0) == 'lifetime'
+
+
+@pytest.mark.parametrize(('settings', 'seconds', 'reasons'), [
+    ({'heartbeat': HEARTBEAT}, 300.0, []),  # robot_timeout is 10 s
+    ({}, 300.0, []),  # boot_timeout is 100 s
+    ({'heartbeat': HEARTBEAT}, 2000.0, ['lifetime'])])
+def test_suspended_machine_waits_anew_for_its_launch(tmp_path, settings, seconds, reasons):
+    agent = Agent(config(directory=str(tmp_path), **settings))
+    emitted, suspended = [], 0.0
+    agent.emit = emitted.append
+    agent.loop.clock = lambda: boot_clock() + suspended
+    agent._restart_watchdog()
+    agent._watch()
+    suspended = seconds
+    agent._watch()
+    assert [e['reason'] for e in emitted] == reasons
 
 
 def test_late_heartbeat_does_not_rearm_the_watchdog():
