@@ -40,6 +40,7 @@ from fogros2_monitor.parameters import Parameters, shown
 from fogros2_monitor.services import Services
 from fogros2_monitor.topics import GraphNode, LOOK, Topic
 from image_transport_h264 import ending
+from image_transport_h264.lazy import every
 
 #: Number of messages to keep for a slow viewer.
 BACKLOG = 64
@@ -77,7 +78,7 @@ class BridgeNode(GraphNode, ServerListener):
         gate = int(self.declare_parameter('gate', -1).value)
         self._look()
         self.create_subscription(ParameterEvent, '/parameter_events', self._tell_change, 1000)
-        self.create_timer(LOOK, self._look)
+        every(self, LOOK, self._look)
         self.get_logger().info(f'serving ws://{address}:{self._server.port}')
         if gate >= 0:
             threading.Thread(target=self._follow, args=(gate,), name='gate', daemon=True).start()

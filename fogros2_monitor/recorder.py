@@ -22,6 +22,7 @@ from rclpy.utilities import remove_ros_args
 
 from fogros2_monitor.topics import GraphNode, LOOK, Topic
 from image_transport_h264 import ending
+from image_transport_h264.lazy import every
 
 #: Bytes of the disk that stay free.
 FREE = 1_000_000_000
@@ -48,8 +49,8 @@ class RecorderNode(GraphNode):
         self._writer = foxglove.open_mcap(
             path, context=self.viewers, writer_options=MCAPWriteOptions(profile='ros2'))
         self._look()
-        self.create_timer(LOOK, self._tick)
-        self._missing = self.create_timer(PATIENCE, self._report_missing)
+        every(self, LOOK, self._tick)
+        self._missing = every(self, PATIENCE, self._report_missing)
         self.get_logger().info(f'recording {", ".join(names)} to {path}')
 
     def destroy_node(self) -> None:

@@ -36,7 +36,7 @@ from fogros2_replicas import figures
 from fogros2_replicas.calls import Action, Answer, Calls
 from fogros2_replicas.pairs import Header, header_of, Pair
 from image_transport_h264 import ending
-from image_transport_h264.lazy import printable
+from image_transport_h264.lazy import every, printable
 
 #: Seconds between two looks at the graph, between two writes of the figures, and after which
 #: missing names are reported. Requests of one replica that may be without an answer, and names and
@@ -215,8 +215,8 @@ class FirstAnswer(Node):
         self._path = f"{settings['folder']}/{settings['name']}"
         # opened for writing too, so that it never ends; ``wake`` writes empty lines
         self._events = os.open(f'{self._path}.events', os.O_RDWR | os.O_NONBLOCK)
-        self.create_timer(WRITE, self._write)
-        self.create_timer(LOOK, self._look)
+        every(self, WRITE, self._write)
+        every(self, LOOK, self._look)
         self._watcher = threading.Thread(target=self._watch, daemon=True)
         self._watcher.start()
 

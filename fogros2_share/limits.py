@@ -19,7 +19,6 @@ import time
 from typing import Any, Optional
 
 import rclpy
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
@@ -27,6 +26,7 @@ from fogros2 import ros_types
 from fogros2_share.node import DEPTH, form_of, LOOK, others, profile
 from fogros2_share.wire import Echoes, Form
 from image_transport_h264 import ending
+from image_transport_h264.lazy import every
 
 #: The type whose messages are limited by child frame.
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
@@ -103,8 +103,7 @@ class Leaving(Way):
         self.latched: list[int] = []
         #: What the next message has: transforms by child frame, or one serialized message.
         self._newest: dict[str, Any] = {}
-        self._timer = node.create_timer(
-            period, self._send, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=False)
+        self._timer = every(node, period, self._send, autostart=False)
 
     def look(self) -> None:
         """Follow the publishers, and expect the other direction's latched messages anew."""
@@ -183,7 +182,7 @@ class Limits(Node):
             leaving = Leaving(self, name, out, period)
             self._ways += [leaving, Coming(self, back, name, leaving)]
         self._complaints: set[str] = set()
-        self.create_timer(LOOK, self._look)
+        every(self, LOOK, self._look)
 
     def _look(self) -> None:
         for way in self._ways:

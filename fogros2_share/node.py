@@ -35,6 +35,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from fogros2 import ros_types
 from fogros2_share.wire import decode, DEEPEST, Echoes, encode, Form, LARGEST, LINE
 from image_transport_h264 import ending
+from image_transport_h264.lazy import every
 
 #: In the folder of a machine: its topics in lines, and the folder of its relay, with its socket
 #: and with a file for each other machine.
@@ -164,7 +165,7 @@ class Relay(Node):
             self._complain(f"{', '.join(missing)} of other robots are not heard: the machine was "
                            f"made for {', '.join(sorted(listed))}; delete it, and launch again")
         threading.Thread(target=self._serve, name='fog-share-serve', daemon=True).start()
-        self.create_timer(LOOK, self._tick)
+        every(self, LOOK, self._tick)
 
     def _tick(self) -> None:
         """Look for changes of the topics and of the other machines."""

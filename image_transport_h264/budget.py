@@ -24,7 +24,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
 from image_transport_h264 import sharing
-from image_transport_h264.lazy import FEEDBACK_QOS, LATCHED_QOS, LazyNode, LONGEST
+from image_transport_h264.lazy import every, FEEDBACK_QOS, LATCHED_QOS, LazyNode, LONGEST
 from image_transport_h264.sharing import Claim, Link, LISTEN, MOST_LINKS, UNLIMITED
 
 #: Seconds between two reports; window of the rate that a stream uses, and most messages in it.
@@ -57,7 +57,7 @@ class Budget:
         self._reports = node.create_publisher(Float64MultiArray, f'{stream}/share', FEEDBACK_QOS)
         self._announced: Optional[Subscription] = None
         self._listen()
-        node.create_timer(REPORT, self._report)
+        every(node, REPORT, self._report)
 
     # --- in the executor's thread
 

@@ -14,7 +14,7 @@ from typing import Optional
 
 from sensor_msgs.msg import CameraInfo, Image
 
-from image_transport_h264.lazy import IMAGE_QOS, LazyNode, Relay, run, Tap
+from image_transport_h264.lazy import every, IMAGE_QOS, LazyNode, Relay, run, Tap
 from image_transport_h264.message import CAMERA_INFO, camera_info_topic
 from image_transport_h264.senders import make_sender
 
@@ -40,7 +40,7 @@ class EncoderNode(LazyNode):
                                 f'{stream}/{CAMERA_INFO}', IMAGE_QOS)
         self._listeners_changed()
         named = str(self.declare_parameter('topic', '').value) or topic
-        self._look = self.create_timer(PATIENCE, lambda: self._look_for_images(topic, named))
+        self._look = every(self, PATIENCE, lambda: self._look_for_images(topic, named))
         self.get_logger().info(f'{topic} goes out as {stream} ({codec})')
 
     def _look_for_images(self, topic: str, named: str) -> None:

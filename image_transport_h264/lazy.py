@@ -8,11 +8,13 @@ import threading
 from typing import Any, Optional
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from image_transport_h264 import ending
 from image_transport_h264.acknowledgement import wait_for_all_acked
@@ -53,6 +55,19 @@ def best_effort(qos: QoSProfile) -> QoSProfile:
 def printable(text: str) -> str:
     """Return a text of another computer without what controls a terminal."""
     return ''.join(c if c.isprintable() else '?' for c in text)
+
+
+def every(
+    node: Node, seconds: float, call: Callable[[], None], *, autostart: bool = True,
+) -> Timer:
+    """
+    Call a function of a node periodically, also while the system clock is set back.
+
+    A timer of the node's own clock would stop for as long, and under ``use_sim_time`` wait for
+    ``/clock``.
+    """
+    return node.create_timer(
+        seconds, call, clock=Clock(clock_type=ClockType.STEADY_TIME), autostart=autostart)
 
 
 def run(kind: Callable[[], LazyNode]) -> None:

@@ -45,7 +45,7 @@ from fogros2_monitor.dashboard.ways import (
     Topic,
 )
 from image_transport_h264 import ending
-from image_transport_h264.lazy import Tap
+from image_transport_h264.lazy import every, Tap
 from image_transport_h264.sharing import claim_of, UNLIMITED, VALID
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class GraphNode(Node):
         self._cameras: dict[str, Camera] = {}
         #: Time and contents of the last report of each stream about its share.
         self._reports: dict[str, tuple[float, Any]] = {}
-        self.create_timer(LOOK, self._look)
+        every(self, LOOK, self._look)
 
     def know(self, machines: dict[str, list[str]], *, pictures: bool) -> None:
         """Set the nodes of each machine, and whether to take pictures; from any thread."""

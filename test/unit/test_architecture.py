@@ -311,6 +311,12 @@ def test_forbidden_words(pattern: str) -> None:
             assert not found, f'{path.relative_to(ROOT)}: {found[0]!r}: {FORBIDDEN[pattern]}'
 
 
+def test_nodes_have_only_steady_timers() -> None:
+    """A timer of the system clock or of ``/clock`` stands still while that clock does."""
+    found = [name for name, path in modules().items() if '.create_timer(' in text(path)]
+    assert found == ['image_transport_h264.lazy']
+
+
 def test_only_one_module_starts_processes() -> None:
     """A command that is waited for goes through ``process``; streams and daemons are few."""
     # relocation is a program for machines
