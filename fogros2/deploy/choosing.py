@@ -11,6 +11,7 @@ import time
 from typing import Optional
 
 from fogros2 import feature, model, plan
+from fogros2.agent.loop import boot_clock
 from fogros2.errors import FogError
 from fogros2.feature import Cost
 from fogros2.model import MachineSpec
@@ -31,9 +32,9 @@ class Choices:
         self._lock = threading.Lock()
         self._resolved: dict[str, MachineSpec] = {}
         self._places: dict[str, list[MachineSpec]] = {}
-        #: Of each machine that exists or will be created, with the time when it began, and of
-        #: those that have ended.
-        self._costs: dict[str, tuple[Cost, Optional[float]]] = {}
+        #: Of each machine that exists or will be created, with ``_clocks`` when it began,
+        #: and of those that have ended.
+        self._costs: dict[str, tuple[Cost, Optional[tuple[float, float]]]] = {}
         self._ended: list[Cost] = []
 
     def resolved(self, spec: MachineSpec) -> MachineSpec:
@@ -111,20 +112,30 @@ class Choices:
         """Let an expected machine cost from now on; idempotent."""
         with self._lock:
             cost, begin = self._costs[name]
-            self._costs[name] = cost, time.monotonic() if begin is None else begin
+            self._costs[name] = cost, begin or _clocks()
 
     def end(self, name: str) -> None:
         """Stop to count a machine's cost; idempotent."""
         with self._lock:
             cost, begin = self._costs.pop(name, (None, None))
             if cost is not None and begin is not None:
-                self._ended.append(dataclasses.replace(
-                    cost, seconds=time.monotonic() - begin, ended=True))
+                self._ended.append(dataclasses.replace(_until_now(cost, begin), ended=True))
 
     def costs(self) -> list[Cost]:
         """Return what all machines of the launch cost, in the order of their names."""
-        now = time.monotonic()
         with self._lock:
             return sorted([*self._ended, *(
-                dataclasses.replace(cost, seconds=0.0 if begin is None else now - begin)
+                cost if begin is None else _until_now(cost, begin)
                 for cost, begin in self._costs.values())], key=lambda cost: cost.spec.name)
+
+
+def _clocks() -> tuple[float, float]:
+    """Return seconds with and without the time for which this computer was suspended."""
+    return boot_clock(), time.monotonic()
+
+
+def _until_now(cost: Cost, begin: tuple[float, float]) -> Cost:
+    # a machine that is not kept ends robot_timeout after the robot is suspended
+    passed, awake = (now - then for now, then in zip(_clocks(), begin))
+    longest = passed if cost.spec.on_exit == 'keep' else awake + cost.spec.robot_timeout
+    return dataclasses.replace(cost, seconds=min(passed, longest))

@@ -11,6 +11,7 @@ import time
 from typing import Any, Optional
 
 from fogros2 import plan
+from fogros2.agent.loop import boot_clock
 from fogros2.agent_client import AgentClient, Heartbeat
 from fogros2.deploy.context import Context
 from fogros2.deploy.life import Life, Phase
@@ -50,7 +51,7 @@ class MachineJob(Site):
         self.spec = spec
         #: The lifetime that the launch asks for, in seconds.
         self._lifetime = spec.lifetime
-        #: When the agent ends the machine, by ``time.monotonic``.
+        #: When the agent ends the machine, by ``boot_clock``.
         self.expires = 0.0
         self.name = spec.name
         self.record = Record(spec.name, spec.provider, spec, asked=spec.options)
@@ -101,8 +102,13 @@ class MachineJob(Site):
     def restart_lifetime(self, seconds: float) -> None:
         """Note that the agent gets a lifetime which starts now."""
         self.spec = dataclasses.replace(self.spec, lifetime=seconds)
-        self.expires = time.monotonic() + seconds
+        self.expires = boot_clock() + seconds
         self.save(spec=self.spec, armed=time.time())
+
+    @property
+    def time_left(self) -> float:
+        """Seconds until the agent ends the machine."""
+        return self.expires - boot_clock()
 
     def push(self, kind: str, port: int = 0, **changes: Any) -> None:
         """Push the undo of what the next step makes, and record it with other changes."""

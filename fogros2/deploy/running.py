@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import dataclasses
 import threading
-import time
 from typing import Any, Optional
 
 from fogros2 import feature
@@ -272,7 +271,7 @@ class RunningMachine(MachineJob):
         :raises FogError: the agent does not answer.
         """
         with self._shortening:
-            seconds = self.expires - time.monotonic()
+            seconds = self.time_left
             try:
                 allowed = self._context.choices.limited(
                     dataclasses.replace(self.spec, lifetime=seconds), made=True).lifetime

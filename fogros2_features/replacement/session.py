@@ -7,7 +7,6 @@ import asyncio
 from collections.abc import Callable, Mapping
 import functools
 import os
-import time
 from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2 import plan
@@ -272,8 +271,7 @@ class Interruptible(Session):
     def go_on(self, event: MachineInterrupted, remedy: str = '') -> list[Action]:
         """Apply ``on_interrupt``; return what this needs; see the base class."""
         if self.replacer is not None:
-            if event.lost and self.running is not None and (
-                    time.monotonic() > self.running.expires - _LAST):
+            if event.lost and self.running is not None and self.running.time_left < _LAST:
                 return super().go_on(event, 'its time was over: raise lifetime=, or the budget '
                                      'that shortens it')
             self._logger.warning(f'{event}; a new machine will continue its nodes')

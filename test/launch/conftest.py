@@ -38,7 +38,7 @@ class FakeMachine:
         self.exits_on_stop = True
         #: Why the machine is gone, '' while it is there.
         self.lost = ''
-        self.expires = math.inf
+        self.time_left = math.inf
         #: Whether the provider confirms a notice: its answers, of which the last stays.
         self.confirms = [True]
         self.pids = iter(range(4001, 5000))

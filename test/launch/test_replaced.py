@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-import time
 
 from launch import LaunchDescription
 from launch.actions import ExecuteProcess, OpaqueFunction, RegisterEventHandler
@@ -131,7 +130,7 @@ def test_machine_at_the_end_of_its_lifetime_is_not_replaced(run, fake, planner, 
     planner._options['image'] = 'mine'
 
     def ended(event):
-        fake.machines['planner'].expires = time.monotonic() - 1.0
+        fake.machines['planner'].time_left = -1.0
         return says(fake, 'lost', reason='deleted')(event)
 
     watch.at_start = {1: ended}

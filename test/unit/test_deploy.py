@@ -830,12 +830,14 @@ def test_agent_that_was_started_again_watches_for_the_notice(launch, provider, m
     monkeypatch.setattr(provider, 'capabilities_of', lambda machine: dataclasses.replace(
         provider.capabilities, preemption_notice=('look',)))
     mine.machine = Machine('i-1', 'planner', 'fake', MachineState.RUNNING)
-    mine.expires = time.monotonic() + 100.0
+    mine.restart_lifetime(100.0)
+    boot, suspended = time.clock_gettime, 30.0
+    monkeypatch.setattr(time, 'clock_gettime', lambda clock: boot(clock) + suspended)
     Arming(context, mine).watch_notice()
     ((command, words),) = requests
     assert command == 'configure' and words['again'] and words['notice'] == ['look']
-    # its lifetime goes on
-    assert 90.0 < words['lifetime'] <= 100.0
+    # its lifetime goes on, also while the robot is suspended
+    assert 60.0 < words['lifetime'] <= 70.0
 
 
 def test_robot_alone_uses_a_relay(members, monkeypatch):

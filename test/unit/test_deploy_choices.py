@@ -284,14 +284,31 @@ def test_kept_machine_gets_its_owner_before_it_starts(
 
 
 def test_a_machine_s_cost_runs_until_it_has_ended(launch, provider, monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr(choosing.time, 'monotonic', lambda: now[0])
+    now = 100.0
+    monkeypatch.setattr(choosing, '_clocks', lambda: (now, now))
     mine = create(launch)
-    now[0] += 60
+    now += 60
     assert launch.costs() == [Cost(mine.spec, Decimal('0.5'), 60.0)]
     mine.undo.close()
-    now[0] += 60
+    now += 60
     assert launch.costs() == [Cost(mine.spec, Decimal('0.5'), 60.0, ended=True)]
+
+
+@pytest.mark.parametrize(('settings', 'seconds'), [
+    ({'robot_timeout': 9999.0}, 3660.0), ({'robot_timeout': 120.0}, 180.0),
+    ({'robot_timeout': 120.0, 'on_exit': 'keep'}, 3660.0)])
+def test_machine_costs_while_the_robot_is_suspended(monkeypatch, settings, seconds):
+    clocks = {time.CLOCK_BOOTTIME: 100.0, time.CLOCK_MONOTONIC: 100.0}
+    monkeypatch.setattr(time, 'clock_gettime', clocks.__getitem__)
+    monkeypatch.setattr(time, 'monotonic', lambda: clocks[time.CLOCK_MONOTONIC])
+    choices = choosing.Choices(lambda name: None, lambda event: None)
+    choices.expect(dataclasses.replace(SPEC, **settings), Decimal(1))
+    choices.begin(SPEC.name)
+    clocks[time.CLOCK_BOOTTIME] += 3660.0
+    clocks[time.CLOCK_MONOTONIC] += 60.0
+    assert [cost.seconds for cost in choices.costs()] == [seconds]
+    choices.end(SPEC.name)
+    assert [cost.seconds for cost in choices.costs()] == [seconds]
 
 
 def test_provider_knows_what_will_be_installed(launch, provider, monkeypatch):

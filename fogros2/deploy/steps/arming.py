@@ -8,7 +8,6 @@ import contextlib
 import functools
 import hashlib
 import secrets
-import time
 from typing import Any, Optional
 
 from fogros2 import model, plan
@@ -155,7 +154,7 @@ class Arming(Step):
             'configure', timeout=self._context.timeouts.agent, launch=self._context.launch_id,
             again=True, notice=self._notice,
             # which this restarts
-            lifetime=max(1.0, job.expires - time.monotonic()))
+            lifetime=max(1.0, job.time_left))
 
     def _rearm(self) -> None:
         # a later call may get through; the current step reports a lasting failure
