@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Measure the offset of a machine's clock against the robot's, as NTP does.
+Read a server's clock; measure the offset of a machine's against the robot's, as NTP does.
 
 The machine adds its time to the robot's message and returns it; that time lies between sending and
 receiving: RFC 5905, sections 8 and 10.
@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections import deque
 import dataclasses
+from email.utils import parsedate_to_datetime
+import time
 from typing import Optional
 
 #: Offset in seconds above which a launch warns: TF and message filters tolerate a few frames.
@@ -67,6 +69,25 @@ class OffsetFilter:
             self._samples.clear()
         self._samples.append(sample)
         return min(reversed(self._samples), key=lambda one: one.uncertainty)
+
+
+class ServerClock:
+    """The clock of an HTTP server, which may be right where this computer's is wrong."""
+
+    def __init__(self) -> None:
+        self._last = ('', 0.0)
+
+    def note(self, date: str) -> None:
+        """Note the Date header of a response that has just come, '' if it has none."""
+        self._last = date, time.monotonic()
+
+    def now(self) -> float:
+        """Return the time of the last response, continued; else that of this computer."""
+        date, since = self._last
+        try:
+            return parsedate_to_datetime(date).timestamp() + time.monotonic() - since
+        except (TypeError, ValueError):
+            return time.time()
 
 
 class OffsetAlarm:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 import contextlib
-from email.utils import parsedate_to_datetime
 import json
 import math
 import os
@@ -21,6 +20,7 @@ import time
 from typing import Any, Optional, TYPE_CHECKING, TypeVar
 from urllib.parse import urlencode, urlsplit
 
+from fogros2.clock import ServerClock
 from fogros2.errors import DeadlineExceeded, ProviderError
 from fogros2.kubernetes_client import configuration as kubeconfig
 from fogros2.kubernetes_client.answers import (
@@ -63,14 +63,13 @@ class Api:
     :raises PrerequisiteError: no kubeconfig, no such context, or no valid credentials.
     """
 
-    #: The Date header of the last response, and when it came (``time.monotonic``).
-    _date = ('', 0.0)
     #: When ``doubt`` has last asked the server.
     _doubted = -math.inf
 
     def __init__(self, context: str = '') -> None:
         self.context, self.namespace, self._client = kubeconfig.load(context)
         self._lost = -DOUBT
+        self.clock = ServerClock()
 
     @property
     def server(self) -> str:
@@ -82,14 +81,6 @@ class Api:
         return {each['key']: each['value']
                 for each in self._client.configuration.auth_settings().values()
                 if each['in'] == 'header' and each['value']}
-
-    def now(self) -> float:
-        """Return the time of the API server's last response, continued; else of this computer."""
-        text, since = self._date
-        try:
-            return parsedate_to_datetime(text).timestamp() + time.monotonic() - since
-        except (TypeError, ValueError):
-            return time.time()
 
     # -- requests -------------------------------------------------------------------------------
 
@@ -203,7 +194,7 @@ class Api:
                 timeout=urllib3.Timeout(connect=CONNECT, read=read))
         except http_errors() as error:
             raise self._unreachable(error) from error
-        self._date = response.headers.get('Date', ''), time.monotonic()
+        self.clock.note(response.headers.get('Date', ''))
         return response
 
     def _url(self, path: str, query: Query) -> str:

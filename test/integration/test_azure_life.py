@@ -48,7 +48,8 @@ class Robot:
         self.provider = AzureProvider()
 
     def spec(self, name: str = 'planner', **options: object) -> MachineSpec:
-        return MachineSpec(name, 'azure', {'region': HOME, 'vm_size': SMALL, **options})
+        return MachineSpec(
+            name, 'azure', {'region': HOME, 'vm_size': SMALL, **options}, lifetime=7200.0)
 
     def request(self, **fields: object) -> CreateRequest:
         return dataclasses.replace(CreateRequest(

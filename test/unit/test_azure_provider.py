@@ -264,6 +264,25 @@ def test_token_without_a_network_is_no_lack_of_credentials(monkeypatch, error, k
     assert type(caught.value) is kind
 
 
+def test_end_of_a_machine_is_by_the_clock_of_azure(monkeypatch):
+    bodies = []
+
+    def answer(method, url, what, body, **options):
+        bodies.append(body)
+        return Answer(200, {'Date': 'Mon, 30 Nov 2026 10:00:00 GMT'}, {})
+
+    monkeypatch.setenv('AZURE_SUBSCRIPTION_ID', 'one')
+    monkeypatch.delenv(account.ENDPOINT_VARIABLE, raising=False)
+    monkeypatch.setattr(time, 'time', lambda: 0.0)  # a robot without a battery
+    own = account.Account()
+    monkeypatch.setattr(own, 'having', lambda cancel: own)
+    monkeypatch.setattr(own, 'ask', answer)
+    own.call('GET', own.vm('planner'), 'looking')
+    first = ending.schedule(own, 'planner', 'westus', 8 * 3600.0)
+    assert time.strftime('%d %H:%M', time.gmtime(first)) == '30 18:02'
+    assert bodies[-1]['properties']['dailyRecurrence'] == {'time': '1802'}
+
+
 @pytest.mark.parametrize(('link', 'followed'), [
     ('https://management.azure.com/next', True), ('https://management.azure.com:443/next', True),
     ('https://MANAGEMENT.azure.com/next', True), ('http://management.azure.com/next', False),

@@ -12,6 +12,7 @@ import time
 from typing import Any, Optional
 from urllib.parse import urlsplit
 
+from fogros2.clock import ServerClock
 from fogros2.errors import FogError, PrerequisiteError, ProviderError
 from fogros2.provider.azure import login
 from fogros2.provider.azure.failures import refusal
@@ -73,6 +74,7 @@ class Account(RestAccount):
     def __init__(self) -> None:
         super().__init__()
         self._lock = threading.Lock()
+        self.clock = ServerClock()
         #: Machines that this process has just created, as Azure reports them.
         self.seen: dict[str, Mapping[str, Any]] = {}
 
@@ -180,7 +182,9 @@ class Account(RestAccount):
         """Make a request below the endpoint, which alone gets the token."""
         if _server(url) != _server(endpoint()):
             raise ProviderError(f'{what} failed: Azure named another server, {url[:100]}')
-        return self.ask(method, url, what, body, query=query, repeatable=method != 'POST')
+        answer = self.ask(method, url, what, body, query=query, repeatable=method != 'POST')
+        self.clock.note(answer.headers.get('Date', ''))
+        return answer
 
     def refusal(self, status: int, body: Any, what: str) -> FogError:
         return refusal(status, body, what)

@@ -19,7 +19,6 @@ from typing import Any, Optional
 
 from fogros2.errors import ConfigurationError, FogError, MachineNotFound, ProviderError
 from fogros2.model import MachineSpec, MachineState
-from fogros2.provider import TAG_EXPIRES
 from fogros2.provider.azure import ending, login, machines, prices
 from fogros2.provider.azure.account import Account, endpoint, subscription
 from fogros2.provider.azure.disks import AzureDisks
@@ -266,9 +265,9 @@ class Azure(AzureImages, AzureDisks):
         principal = str(entry.get('identity', {}).get('principalId', ''))
         if prepared.guarded and principal and ending.assign(self._account, name, principal):
             return
-        end = float(order.tags.get(TAG_EXPIRES, 0)) or time.time() + order.spec.lifetime
-        first = ending.schedule(self._account, name, region, end)
-        price = Decimal(entry['tags'].get(TAG_PRICE, 0)) * int(first - time.time()) / 3600
+        first = ending.schedule(self._account, name, region, order.spec.lifetime)
+        seconds = int(first - self._account.clock.now())
+        price = Decimal(entry['tags'].get(TAG_PRICE, 0)) * seconds / 3600
         worst = f', at most ${price:.2f}' if price else ''
         self.notes[name] = [
             'if this robot vanishes, the machine powers itself off and is billed until Azure '
@@ -374,8 +373,7 @@ class Azure(AzureImages, AzureDisks):
         """Set the schedule of an adopted machine anew, if it has one; the tags say the rest."""
         path = self._account.path(machine.vm, 'providers/Microsoft.DevTestLab/schedules')
         if any(True for _ in self._account.pages(path, f'looking how {machine.vm} ends')):
-            ending.schedule(self._account, machine.vm, machine.region,
-                            time.time() + spec.lifetime)
+            ending.schedule(self._account, machine.vm, machine.region, spec.lifetime)
 
     def stop(self, machine: VmId) -> None:
         self._account.seen.pop(machine.vm, None)

@@ -136,16 +136,18 @@ def assign(account: Account, name: str, principal: str) -> bool:
         return False
 
 
-def schedule(account: Account, name: str, region: str, end: float) -> float:
+def schedule(account: Account, name: str, region: str, lifetime: float) -> float:
     """
     Let Azure deallocate a machine at a time of day, and return when it first does.
 
-    :param end: seconds since the epoch; later than a day from now, this process sets the time
-        anew as long as it runs.
+    :param lifetime: in seconds; of more than a day, this process sets the time anew as long as it
+        runs. Azure's clock counts, because the robot's may be wrong.
     """
+    end = account.clock.now() + lifetime
+
     def put() -> float:
         # rounded up: a minute that has begun would be tomorrow's
-        first = min(end, time.time() + DAY) // 60 * 60 + 120
+        first = min(end, account.clock.now() + DAY) // 60 * 60 + 120
         account.having(None).call('PUT', path, f'scheduling the end of {name}', {
             'location': region, 'properties': {
                 'status': 'Enabled', 'taskType': 'ComputeVmShutdownTask', 'timeZoneId': 'UTC',

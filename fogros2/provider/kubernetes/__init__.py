@@ -239,7 +239,7 @@ class KubernetesProvider(Provider):
         if machine_id in self._made or lifetime is None or not begun:
             return {}
         # by the clock of the cluster: that of this computer may be wrong
-        age = max(0.0, api.now() - pods.timestamp(str(begun)))
+        age = max(0.0, api.clock.now() - pods.timestamp(str(begun)))
         return {'spec': {'activeDeadlineSeconds': int(age + lifetime) + 1}}
 
     def describe(self, machine_id: str) -> Machine:
