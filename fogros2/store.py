@@ -26,6 +26,7 @@ import time
 from typing import Any, Optional, TYPE_CHECKING, TypeVar
 
 from fogros2 import model, process
+from fogros2.agent.loop import boot_clock
 from fogros2.errors import (
     Cancelled,
     ConfigurationError,
@@ -235,6 +236,17 @@ class Record:
         """Whether the launch that uses the machine still runs."""
         return process_alive(self.pid, self.pid_start, self.boot)
 
+    @property
+    def earliest(self) -> float:
+        """
+        The begin of its launch, or of this boot, in seconds since the epoch; 0 if unknown.
+
+        Noted times may be earlier: the system clock was set since.
+        """
+        if not self.boot or self.boot != boot_id():
+            return 0.0
+        return time.time() - boot_clock() + self.pid_start / os.sysconf('SC_CLK_TCK')
+
 
 class Store:
     """
@@ -307,8 +319,9 @@ class Store:
         requests = []
         for path in sorted((self.root / 'requests').glob('[!.]*.json')):
             try:
-                age = time.time() - path.stat().st_mtime
-                requests.append((record_from_json(json.loads(path.read_text())), age))
+                record = record_from_json(json.loads(path.read_text()))
+                since = max(path.stat().st_mtime, record.earliest)
+                requests.append((record, time.time() - since))
             except (OSError, ValueError, TypeError, KeyError, AttributeError):
                 continue  # another program has just removed it, or it is damaged
         return requests

@@ -406,7 +406,8 @@ def stopped_at(
     if record is None:
         return None
     try:
-        return (store.machine(record.name) / 'record.json').stat().st_mtime
+        written = (store.machine(record.name) / 'record.json').stat().st_mtime
+        return max(written, record.earliest)
     except OSError:
         return None
 

@@ -116,7 +116,7 @@ class Entry:
         record = self.record
         if record is not None and record.armed:
             # A launch may have reused the machine, or shortened the lifetime, since the creation.
-            ends = [record.armed + record.spec.lifetime]
+            ends = [max(record.armed, record.earliest) + record.spec.lifetime]
         # a robot whose clock is wrong may note an end that is long before the beginning
         begin = (self.known.created or 0.0) - CLOCK_TOLERANCE
         return max((at for at in ends if at > begin), default=None)

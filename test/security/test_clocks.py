@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import socket
 import threading
@@ -15,7 +16,7 @@ from fogros2.errors import ConnectError
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import TAG_EXPIRES, TAG_ROBOT
 from fogros2.shell import ssh_connection
-from fogros2.store import Record, robot_id
+from fogros2.store import boot_id, Record, robot_id, Store
 from ros2fog_cli.api import endings
 from ros2fog_cli.api.machines import Entry
 
@@ -29,6 +30,38 @@ def test_gc_keeps_a_machine_that_was_made_in_1970(armed: float) -> None:
     entry = Entry('slam', 'fake', machine, Record(
         'slam', 'fake', spec, machine_id='id', created=60.0, armed=armed))
     assert endings.why_end(entry, time.time(), 86400.0) == ''
+
+
+@pytest.mark.parametrize('state', [MachineState.RUNNING, MachineState.STOPPED])
+def test_gc_keeps_a_machine_when_the_clock_is_set_forward(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, state: MachineState,
+) -> None:
+    """The times are of this boot, ten minutes ago, when the clock was ten days behind."""
+    then = time.time() - 10 * 86400
+    monkeypatch.setattr('fogros2.store.boot_clock', lambda: 600.0, raising=False)
+    store = Store(tmp_path)
+    record = store.save(Record(
+        'slam', 'container', MachineSpec('slam', 'container', on_exit='keep', lifetime=3600.0),
+        machine_id='id', created=then, armed=then, boot=boot_id()))
+    os.utime(store.machine('slam') / 'record.json', (then, then))
+    machine = Machine('id', 'slam', 'container', state, then, tags={TAG_ROBOT: robot_id()})
+    entry = Entry('slam', 'container', machine, record)
+    since = endings.stopped_at(machine, record, store)
+    assert endings.why_end(entry, time.time(), 86400.0, since) == ''
+
+
+def test_request_is_as_young_as_its_launch(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    """Its machine may still appear, although the clock was set forward by ten days."""
+    monkeypatch.setattr('fogros2.store.boot_clock', lambda: 86400.0, raising=False)
+    store = Store(tmp_path)
+    store.set_aside(Record('cam', 'gcp', MachineSpec('cam', 'gcp'), last='abcdef', boot=boot_id(),
+                           pid_start=(86400 - 30) * os.sysconf('SC_CLK_TCK')))
+    (path,) = (tmp_path / 'requests').iterdir()
+    os.utime(path, (time.time() - 10 * 86400,) * 2)
+    ((_, age),) = store.requests()
+    assert age == pytest.approx(30.0, abs=5.0)
 
 
 class Silent(paramiko.ServerInterface):
