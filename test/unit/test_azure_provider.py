@@ -16,10 +16,12 @@ import pytest
 from fogros2 import AzureCloudInstance
 from fogros2.errors import ConfigurationError, PrerequisiteError, ProviderError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
+from fogros2.provider import TAG_DEPENDENCIES
 from fogros2.provider.azure import account, ending, failures, login, machines, prices
+from fogros2.provider.azure.images import AzureImages, TAG_KIND
 from fogros2.provider.azure.machines import Prepared
 from fogros2.provider.azure.options import Options
-from fogros2.provider.vm.cloud import Order, Place
+from fogros2.provider.vm.cloud import Order, Place, TAG_DISK, TAG_MADE
 from fogros2.provider.vm.failures import Silent
 from fogros2.provider.vm.rest import Answer
 from rigs.azure import catalogue, schema
@@ -262,6 +264,16 @@ def test_token_without_a_network_is_no_lack_of_credentials(monkeypatch, error, k
     with pytest.raises(PrerequisiteError, match=re.escape(words)) as caught:
         own.token('asking')
     assert type(caught.value) is kind
+
+
+def test_newest_image_is_not_one_of_1970():
+    groups = [{'name': name, 'tags': {
+        TAG_MADE: made, TAG_DEPENDENCIES: 'abcd', TAG_KIND: 'amd64 V2', TAG_DISK: '30'}}
+        for name, made in (('today', '1796000000'), ('old', '900'))]
+    provider = SimpleNamespace(_image_groups=lambda region, query: groups,
+                               _state=lambda group: 'available', _version=lambda group: group)
+    newest = AzureImages.baked(provider, 'westus', Options(), 'abcd')
+    assert newest == {('amd64', 'V2'): ('today', 30)}
 
 
 def test_end_of_a_machine_is_by_the_clock_of_azure(monkeypatch):

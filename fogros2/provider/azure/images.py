@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import secrets
-import time
 from typing import Any
 
 from fogros2.errors import FogError
@@ -46,7 +45,8 @@ class AzureImages(AzurePrices):
         size = self.sizes(region)[entry['properties']['hardwareProfile']['vmSize']]
         kind, made_for = machine_type(size), generation(size)
         group = f'fogros2-image-{secrets.token_hex(6)}'
-        tags = {**image_tags(name, entry['tags'], dependencies), TAG_MADE: str(int(time.time())),
+        made = str(int(self._account.clock.now()))
+        tags = {**image_tags(name, entry['tags'], dependencies), TAG_MADE: made,
                 TAG_KIND: f'{kind.arch} {made_for}'}
         system_disk = entry['properties']['storageProfile']['osDisk']
         # Azure reports no size of a machine that does not run
@@ -105,7 +105,7 @@ class AzureImages(AzurePrices):
             return versions
         groups = self._image_groups(
             region, f"tagName eq '{TAG_DEPENDENCIES}' and tagValue eq '{dependencies}'")
-        for group in sorted(groups, key=lambda one: str(one['tags'].get(TAG_MADE, ''))):
+        for group in sorted(groups, key=lambda one: made_at(one['tags']) or 0.0):
             arch, _, made_for = group['tags'].get(TAG_KIND, '').partition(' ')
             if group['tags'].get(TAG_DEPENDENCIES) == dependencies \
                     and group['tags'].get(TAG_USER, options.user) == options.user \
