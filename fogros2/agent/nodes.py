@@ -413,11 +413,12 @@ class Nodes:
                              respawns=False)
                 self._forget(node)
             return
-        kill = functools.partial(self.processes.kill, pid)
-        kill(signal.SIGINT)
+        kill = self.processes.kill
+        # as Ctrl-C in a terminal: wrappers, such as 'ros2 run', only wait for their children
+        kill(pid if node.spec.get('passes_signals') else -pid, signal.SIGINT)
         node.timers += [
-            self.loop.at(timeouts[0], lambda: kill(signal.SIGTERM)),
-            self.loop.at(sum(timeouts), lambda: kill(signal.SIGKILL))]
+            self.loop.at(timeouts[0], lambda: kill(pid, signal.SIGTERM)),
+            self.loop.at(sum(timeouts), lambda: kill(pid, signal.SIGKILL))]
 
     # -- the end --------------------------------------------------------------------------------
 

@@ -151,10 +151,13 @@ class Processes:
         return child.pid
 
     def kill(self, pid: int, number: int) -> None:
-        """Send a signal to a process that ``start`` returned, SIGKILL to its whole group."""
-        send = os.killpg if number == signal.SIGKILL else os.kill
+        """
+        Send a signal to a process that ``start`` returned.
+
+        :param pid: negative for its whole group, which SIGKILL always goes to.
+        """
         with self.identity.root(), contextlib.suppress(ProcessLookupError, PermissionError):
-            send(pid, number)
+            os.kill(-abs(pid) if number == signal.SIGKILL else pid, number)
 
     def spawn(
         self, argv: list[str], then: Callable[[int], None], *, timeout: float = COMMAND_TIMEOUT,

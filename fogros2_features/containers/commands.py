@@ -347,7 +347,7 @@ def follow(container: Container, number: int) -> NodeSpec:
     return NodeSpec(
         id=f'container-{name}', name=name.partition('-')[2],
         arguments=('sh', '-c', f'exec sh "$FOGROS2_AGENT_DIRECTORY/{FOLLOWER}" "$0" "$@"', name,
-                   container.restart), sigterm_timeout=15.0)
+                   container.restart), passes_signals=True, sigterm_timeout=15.0)
 
 
 def inside(
@@ -375,7 +375,7 @@ def inside(
     grace = max(0.1, node.sigkill_timeout - 1.0)
     name = f'fogros2-{launch}-' + re.sub(r'[^A-Za-z0-9_.-]', '-', node.name)[:60]
     return dataclasses.replace(
-        node, package='', executable='', prefix=(), cwd=None,
+        node, package='', executable='', prefix=(), cwd=None, passes_signals=True,
         features={name: each for name, each in node.features.items() if name != NAME},
         files={**node.files, _OUTER: scripts.NODE.replace(
             '@VARIABLES@', ' '.join(names)).replace('@DDS@', ' '.join(_DDS_VARIABLES)),

@@ -173,6 +173,21 @@ def test_stop_goes_from_sigint_to_sigkill(rig):
     assert rig.wait('exited', node='polite')['returncode'] == -2
 
 
+def test_stop_interrupts_the_children_of_a_node_as_ctrl_c(shared):
+    saves = (
+        'import signal, sys, time\n'
+        'signal.signal(signal.SIGINT, lambda *_: sys.exit("saved"))\n'
+        'print("up", flush=True)\n'
+        'time.sleep(600)\n')
+    (shared.folder / 'saves.py').write_text(saves)
+    # a shell waits for its command, and 'ros2 run' for its program
+    shared.run(NodeSpec('wrapped', 'w-1', arguments=(
+        'sh', '-c', f'{sys.executable} {shared.folder}/saves.py; exit 3')))
+    shared.clients[0].request('stop', nodes=['wrapped'])
+    shared.wait('exited', node='wrapped')
+    assert shared.text('wrapped', 'stderr') == 'saved\n'
+
+
 def test_lost_connection_loses_and_repeats_no_event(rig):
     rig.started().request('start', nodes=[rig.node('n', (
         'import time\n'

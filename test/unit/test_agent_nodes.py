@@ -209,6 +209,17 @@ def test_unknown_node_keeps_no_other_from_its_end(
     nodes.known['a'] = Node({'id': 'a', 'name': 'n'})
     nodes.known['a'].status['pid'] = 4711
     nodes.stop(['a', 'nobody'])
+    assert sent == [(-4711, signal.SIGINT)]
+
+
+def test_node_that_passes_signals_on_gets_sigint_alone(
+    nodes: Nodes, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sent: list[tuple[int, int]] = []
+    monkeypatch.setattr(nodes.processes, 'kill', lambda pid, number: sent.append((pid, number)))
+    nodes.known['a'] = Node({'id': 'a', 'name': 'n', 'passes_signals': True})
+    nodes.known['a'].status['pid'] = 4711
+    nodes.stop(['a'])
     assert sent == [(4711, signal.SIGINT)]
 
 

@@ -213,7 +213,7 @@ def test_each_launch_has_names_of_its_own():
     assert containers.called(named, 0, 'abcdef') == 'fogros2-abcdef-0-my-eyes'
     assert containers.called(unnamed, 1, 'abcdef') == 'fogros2-abcdef-1-b-1'
     node = containers.follow(unnamed, 1)
-    assert (node.name, node.arguments[-2]) == ('b-1', '1-b-1')
+    assert (node.name, node.arguments[-2], node.passes_signals) == ('b-1', '1-b-1', True)
     assert 'name=fogros2-abcdef-$1 ' in containers.follower('abcdef')
 
 
@@ -261,7 +261,7 @@ def test_node_in_an_image_has_the_arguments_of_the_node():
         features={**in_image('demo:1', '--gpus=all', '-v', '/a:/b'), 'mine': {'a': 1}})
     made = containers.inside(node, 'demo:1', 'abcdef', '/ws', '/run/dds.xml', {'MORE': '1'})
     assert (made.package, made.executable, made.features) == ('', '', {'mine': {'a': 1}})
-    assert (made.cwd, made.prefix) == (None, ())
+    assert (made.cwd, made.prefix, made.passes_signals) == (None, (), True)
     assert (made.respawn, made.environment) == (True, node.environment)
     outer, inner = made.arguments[1], made.arguments[6]
     assert made.arguments == (

@@ -817,7 +817,7 @@ def test_nodes_start_in_requests_that_the_agent_can_take(launch, provider, monke
         return NodeSpec(f'{name}.1', name, files={'large.yaml': 'x' * size})
     mine.start([node('a', 9_000_000), node('b', 7_000_000), node('c', 2_000_000), node('d', 0)])
     assert requests == [['a', 'b'], ['c', 'd']]
-    with pytest.raises(AgentError, match=r"'e' can't be sent: .* it has 170002\d\d bytes"):
+    with pytest.raises(AgentError, match=r"'e' can't be sent: .* it has 170003\d\d bytes"):
         mine.start([node('a', 0), node('e', 17_000_000)])
     assert len(requests) == 2
 
