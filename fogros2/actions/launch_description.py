@@ -15,11 +15,19 @@ from launch.actions import (
     IncludeLaunchDescription,
     LogInfo,
     OpaqueFunction,
+    RegisterEventHandler,
     SetEnvironmentVariable,
     SetLaunchConfiguration,
     TimerAction,
     UnsetEnvironmentVariable,
     UnsetLaunchConfiguration,
+)
+from launch_ros.actions import (
+    PushROSNamespace,
+    SetParameter,
+    SetParametersFromFile,
+    SetRemap,
+    SetROSLogDir,
 )
 
 from fogros2.actions.cloud_group import CloudGroup
@@ -34,15 +42,16 @@ from fogros2.runtime import node_spec
 from fogros2.runtime.coordinator import Coordinator, Planned
 from fogros2.runtime.remote_process import remote_of, RemoteProcess
 
-#: Entities that only set something for the entities after them.
-_SETTINGS = (
-    AppendEnvironmentVariable, DeclareLaunchArgument, FogMachine, LogInfo,
-    SetEnvironmentVariable, SetLaunchConfiguration, UnsetEnvironmentVariable,
-    UnsetLaunchConfiguration,
+#: Actions that change what the values of a machine may depend on.
+_SETTERS = (
+    AppendEnvironmentVariable, DeclareLaunchArgument, SetEnvironmentVariable,
+    SetLaunchConfiguration, UnsetEnvironmentVariable, UnsetLaunchConfiguration,
 )
-
-#: Those that change what the values of a machine may depend on.
-_SETTERS = tuple(one for one in _SETTINGS if one not in (FogMachine, LogInfo))
+#: Entities that start nothing when they execute.
+_SETTINGS = (
+    *_SETTERS, FogMachine, LogInfo, PushROSNamespace, RegisterEventHandler, SetParameter,
+    SetParametersFromFile, SetRemap, SetROSLogDir,
+)
 
 
 class FogROSLaunchDescription(LaunchDescription):
@@ -99,7 +108,9 @@ class FogROSLaunchDescription(LaunchDescription):
             # ROS_DOMAIN_ID, have to be applied before that.
             first = next((number for number, entity in enumerate(entities)
                           if not isinstance(entity, _SETTINGS)), len(entities))
-            settled = not any(map(_sets, entities[first:]))
+            settled = not any(
+                _sets(entity) for number, entity in enumerate(entities)
+                if number >= first or isinstance(entity, RegisterEventHandler))
             engage = OpaqueFunction(function=lambda context: coordinator.engage_for(
                 planned, settled=settled))
             entities = [*entities[:first], engage, *entities[first:]]

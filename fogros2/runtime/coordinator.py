@@ -483,7 +483,8 @@ class Coordinator:
         if self._launch is not None and self._launch.drops(event.env or {}):
             self._logger.warning(
                 f"{event.process_name} has another ROS_DOMAIN_ID than the launch: the launch's "
-                'DDS filter drops messages of other domains; start it outside of the launch')
+                f'DDS filter drops messages of other domains; {_EARLY}, or start the process '
+                'outside of the launch')
         others = [name for name in self._replaced
                   if (event.env or {}).get(name) != self.base_environment[name]]
         if others and REMOTE not in vars(event.action) and event.process_name not in self._late:

@@ -27,7 +27,13 @@ from launch.event_handlers import OnProcessExit, OnProcessIO, OnProcessStart
 from launch.events import matches_action
 from launch.events.process import ShutdownProcess, SignalProcess
 from launch.substitutions import EnvironmentVariable, LaunchConfiguration
-from launch_ros.actions import Node
+from launch_ros.actions import (
+    Node,
+    PushROSNamespace,
+    SetParameter,
+    SetRemap,
+    SetROSLogDir,
+)
 import pytest
 
 from fogros2 import CloudGroup, CloudNode, ContainerInstance, FogROSLaunchDescription
@@ -232,6 +238,20 @@ def test_robot_nodes_have_the_dds_environment(run, fake, planner, capfd, descrip
         entities if place == 'before' else entities[::-1])])) == 0
     assert 'dds is <CycloneDDS/>' in capfd.readouterr().out
     assert fake.environment['ROS_DOMAIN_ID'] == '7'
+
+
+@pytest.mark.parametrize('first', [
+    SetParameter('use_sim_time', True), SetRemap('a', 'b'), PushROSNamespace('robot'),
+    SetROSLogDir('/dev/null'),
+    RegisterEventHandler(OnProcessExit(on_exit=[SetLaunchConfiguration('x', 'y')])),
+])
+def test_launch_has_the_domain_set_after_other_settings(run, fake, planner, first):
+    fake.on_start = ends
+    assert run(FogROSLaunchDescription([
+        first, SetEnvironmentVariable('ROS_DOMAIN_ID', '7'), talker(planner)])) == 0
+    assert fake.environment['ROS_DOMAIN_ID'] == '7'
+    # an action of an event may change a machine's values
+    assert (fake.noted('check here')[0] == ([], {})) == isinstance(first, RegisterEventHandler)
 
 
 def test_dds_environment_outlives_its_group(run, fake, planner, capfd):

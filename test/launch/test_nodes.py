@@ -164,6 +164,7 @@ def test_node_whose_dds_the_filter_drops_is_reported(
         package='demo', executable='talker', additional_env={'ROS_DOMAIN_ID': domain})
     assert run(LaunchDescription([node(machine=planner), stops(local), local])) == 0
     assert caplog.text.count('has another ROS_DOMAIN_ID than the launch') == warned
+    assert caplog.text.count('at the beginning of the launch file') == warned
 
 
 def test_a_machine_of_another_type_is_refused():
