@@ -71,10 +71,11 @@ def find_executable(package: str, executable: str, path: str) -> str:
     :raises Refused: the package or the executable is not on this machine.
     """
     folder = f'{prefix_of(package, path)}/lib/{package}'
-    program = f'{folder}/{executable}'
-    if executable and os.path.isfile(program) and os.access(program, os.X_OK):
-        return program
-    names = sorted(os.listdir(folder)) if os.path.isdir(folder) else []
+    names = sorted(
+        name for name in (os.listdir(folder) if os.path.isdir(folder) else ())
+        if os.path.isfile(f'{folder}/{name}') and os.access(f'{folder}/{name}', os.X_OK))
+    if executable in names:
+        return f'{folder}/{executable}'
     raise Refused(
         f"executable '{executable}' not found in package '{package}' on the machine",
         f"it has: {', '.join(names[:20])}" if names else 'it has none there')

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import os
 from pathlib import Path
+import shlex
 from typing import Optional
 
 from fogros2.errors import did_you_mean, WorkspaceError
@@ -27,9 +29,13 @@ def check_program(
         if not Path(prefix, index, package).exists():
             continue
         folder = Path(prefix, 'lib', package)
-        names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+        files = [p for p in folder.iterdir() if p.is_file()] if folder.is_dir() else []
+        names = sorted(p.name for p in files if os.access(p, os.X_OK))
         if executable in names:
             return
+        if (program := folder / executable) in files:
+            raise WorkspaceError(f"'{program}' is not executable",
+                                 f'chmod +x {shlex.quote(str(program))}')
         raise WorkspaceError(
             f"package '{package}' has no executable '{executable}'",
             _nearest(executable, names) or f'{folder} has none')

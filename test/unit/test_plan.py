@@ -132,7 +132,9 @@ def prefix(tmp_path):
     index.mkdir(parents=True)
     (index / 'arm_planning').touch()
     (tmp_path / 'lib/arm_planning').mkdir(parents=True)
-    (tmp_path / 'lib/arm_planning/planner').touch()
+    (tmp_path / 'lib/arm_planning/planner').touch(0o755)
+    (tmp_path / 'lib/arm_planning/script.py').touch(0o644)
+    (tmp_path / 'lib/arm_planning/folder').mkdir()
     return str(tmp_path)
 
 
@@ -150,7 +152,7 @@ def unsourced(tmp_path):
     prefix = tmp_path / 'install' / 'rob_tools'
     for path in ('share/ament_index/resource_index/packages/rob_tools', 'lib/rob_tools/params'):
         (prefix / path).parent.mkdir(parents=True)
-        (prefix / path).touch()
+        (prefix / path).touch(0o755)
     return tmp_path
 
 
@@ -180,6 +182,8 @@ def test_a_weak_guess_does_not_hide_the_hint(tmp_path):
 @pytest.mark.parametrize('package, executable, words', [
     ('arm_planing', 'planner', "did you mean 'arm_planning'"),
     ('arm_planning', 'plannr', "did you mean 'planner'"),
+    ('arm_planning', 'script.py', "/script.py' is not executable .chmod [+]x "),
+    ('arm_planning', 'folder', 'there are: planner[)]'),
     ('zzz', 'planner', 'there are: arm_planning'),
 ])
 def test_a_program_that_is_not_there_is_refused_with_the_nearest(

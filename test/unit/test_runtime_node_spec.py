@@ -30,7 +30,7 @@ def make_package(prefix, name, *executables):
     (prefix / 'share' / name).mkdir(parents=True)
     (prefix / 'lib' / name).mkdir(parents=True)
     for executable in executables:
-        (prefix / 'lib' / name / executable).touch()
+        (prefix / 'lib' / name / executable).touch(0o755)
 
 
 @pytest.fixture
@@ -107,7 +107,6 @@ def test_a_command(context):
     (lambda program: [[program, ' --fast']], (({'prefix': 'demo'}, '/lib/demo/talker --fast'),)),
 ])
 def test_program_of_a_package_among_arguments(context, prefix, command, arguments):
-    (prefix / 'lib/demo/talker').chmod(0o755)
     program = ExecutableInPackage(package='demo', executable='talker')
     spec = convert(ExecuteProcess(cmd=command(program)), context)
     assert (spec.package, spec.arguments) == ('', arguments)
