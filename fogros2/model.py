@@ -347,6 +347,7 @@ class NodeSpec:
     :param arguments: words after the executable, including ``--ros-args`` and its arguments.
     :param files: contents of files to send; ``{'file': key}`` in a Text stands for the path.
     :param environment: variables in addition to the machine's own.
+    :param folders: by variable, such as PATH, folders to put before those of the machine.
     :param passes_signals: SIGINT is for the process alone, and not for its children.
     :param respawn_delay: seconds.
     :param features: the values of features' keywords of nodes, by feature; JSON types only.
@@ -360,6 +361,7 @@ class NodeSpec:
     prefix: tuple[str, ...] = ()
     files: Mapping[str, Text] = dataclasses.field(default_factory=dict)
     environment: Mapping[str, Text] = dataclasses.field(default_factory=dict)
+    folders: Mapping[str, Text] = dataclasses.field(default_factory=dict)
     cwd: Optional[str] = None
     shell: bool = False
     passes_signals: bool = False

@@ -328,6 +328,9 @@ class Nodes:
         environment = {**self.environment, **{
             name: resolve(value, files, path)
             for name, value in spec.get('environment', {}).items()}}
+        for name, value in spec.get('folders', {}).items():
+            environment[name] = ':'.join(
+                filter(None, (resolve(value, files, path), environment.get(name))))
         arguments = [resolve(word, files, path) for word in spec.get('arguments', [])]
         if spec.get('package'):
             arguments.insert(0, find_executable(spec['package'], spec.get('executable', ''), path))

@@ -13,9 +13,21 @@ LOCAL_VARIABLES = frozenset({
     'LD_LIBRARY_PATH', 'LOGNAME', 'OLDPWD', 'PATH', 'PWD', 'PYTHONPATH', 'ROS_HOME',
     'ROS_LOG_DIR', 'SHELL', 'SHLVL', 'TMPDIR', 'USER', '_',
 })
+#: Lists of folders, of which a machine gets those that a launch file adds.
+FOLDERS = ('LD_LIBRARY_PATH', 'PATH', 'PYTHONPATH')
 #: Share of the robot's variables from which a list is a copy of its environment.
 COPY = 0.8
 _reported: set[str] = set()
+
+
+def added_folders(variables: Mapping[str, str], robot: Mapping[str, str]) -> dict[str, str]:
+    """Return the folders that lists of a process have beyond the robot's, by variable."""
+    added = {}
+    for name in FOLDERS:
+        known = ['', *robot.get(name, '').split(':')]
+        if folders := [one for one in variables.get(name, '').split(':') if one not in known]:
+            added[name] = ':'.join(folders)
+    return added
 
 
 def to_send(variables: Mapping[str, str], robot: Mapping[str, str]) -> dict[str, str]:

@@ -437,13 +437,12 @@ class Coordinator:
         self._programs = self.launch.programs()
         for name in environment:
             self._replaced.setdefault(name, self.base_environment.get(name))
-        self._replace('the launch file', environment, self._context.environment,
-                      *private.kept_environments(self._context))
         if private.has_ros_node(self._context) and not (
                 self.base_environment.items() >= environment.items()):
             self._warn_of_late("launch's own ROS node")
         # these are not changes of the launch file, so they must not be sent to machines
-        self.base_environment.update(environment)
+        self._replace('the launch file', environment, self._context.environment,
+                      *private.kept_environments(self._context), self.base_environment)
         for action in private.processes(self._context):
             details, ended = action.process_details, private.completed(action)
             if details is None or ended is None or ended.done():

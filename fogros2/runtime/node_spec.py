@@ -18,7 +18,7 @@ from launch.utilities import normalize_to_list_of_substitutions, perform_substit
 from launch_ros.substitutions import ExecutableInPackage
 
 from fogros2 import plan
-from fogros2.describe.variables import LOCAL_VARIABLES, to_send
+from fogros2.describe.variables import added_folders, FOLDERS, LOCAL_VARIABLES, to_send
 from fogros2.errors import ConfigurationError
 from fogros2.host import workspace
 from fogros2.host.programs import check_program
@@ -170,7 +170,12 @@ def from_action(
         files=files,
         environment={
             key: texts.text(value)
-            for key, value in _environment(action, context, base).items()},
+            for key, value in _environment(action, context, base).items()
+            if contained or key not in FOLDERS},
+        # a container has lists of its own
+        folders={} if contained else {
+            key: texts.text(value)
+            for key, value in added_folders(description.final_env or {}, base).items()},
         cwd=description.final_cwd,
         shell=action.shell,
         emulate_tty=_emulate_tty(action, context),
@@ -188,7 +193,8 @@ def robot_paths(node: NodeSpec, roots: Sequence[str], shared: Sequence[str]) -> 
 
     :param shared: folders that the machine has too.
     """
-    texts = (*node.arguments, *node.environment.values(), *node.files.values(), node.cwd or '')
+    texts = (*node.arguments, *node.environment.values(), *node.folders.values(),
+             *node.files.values(), node.cwd or '')
     parts = [part for text in texts for part in ((text,) if isinstance(text, str) else text)]
     pattern = r'(?<![\w./-])(?:{})(?:/[^\s\'",;:=]*)?(?![\w.-])'.format(
         '|'.join(re.escape(root.rstrip('/')) for root in roots if root.strip('/')) or '(?!)')

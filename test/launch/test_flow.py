@@ -290,6 +290,7 @@ def test_processes_of_the_robot_use_the_ros2_of_the_launch(run, fake, planner, t
     before = os.environ['PATH']
     process = ExecuteProcess(cmd=['sh', '-c', 'echo path is $PATH'], output='screen')
     assert run(LaunchDescription([process, talker(planner)])) == 0
+    assert not fake.machines['planner'].nodes['talker'].folders
     assert f'path is {fake.ros2}:{before}' in capfd.readouterr().out
     assert os.environ['PATH'] == before
 
@@ -362,6 +363,7 @@ def test_environment_of_the_launch_file_is_sent(run, fake, planner, monkeypatch)
     ])) == 0
     assert fake.machines['planner'].nodes['talker'].environment == {
         'SET': 'by the launch file', 'MORE': '1', 'SAME': 'as here'}
+    assert fake.machines['planner'].nodes['talker'].folders == {'PATH': '/robot/bin'}
 
 
 # -- while it runs -------------------------------------------------------------------------------

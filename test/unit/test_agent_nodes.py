@@ -123,6 +123,16 @@ def test_files_are_private_and_have_readable_names(prefix: str, prepared: Prepar
     assert second.read_text() == f'see {first}'
 
 
+def test_folders_come_before_the_lists_of_the_machine(
+    nodes: Nodes, prepared: Prepared, prefix: str,
+) -> None:
+    nodes.environment = {**nodes.environment, 'PATH': '/usr/bin:/bin', 'LD_LIBRARY_PATH': ''}
+    variables = prepared(arguments=['true'], folders={
+        'PATH': [{'share': 'pack'}, '/bin'], 'LD_LIBRARY_PATH': '/a:/b'})[1]['env']
+    assert variables['PATH'] == f'{prefix}/share/pack/bin:/usr/bin:/bin'
+    assert variables['LD_LIBRARY_PATH'] == '/a:/b'
+
+
 @pytest.mark.parametrize('spec, reason', [
     ({}, 'nothing to run'),
     ({'arguments': ['no-such-program']}, "'no-such-program' not found"),

@@ -8,7 +8,7 @@ import os
 import tempfile
 
 from launch import LaunchContext
-from launch.actions import ExecuteProcess, SetEnvironmentVariable
+from launch.actions import AppendEnvironmentVariable, ExecuteProcess, SetEnvironmentVariable
 from launch.substitutions import FindExecutable, LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.substitutions import ExecutableInPackage
@@ -146,9 +146,23 @@ def test_environment(context):
         SetEnvironmentVariable(name, value).execute(context)
     spec = convert_with(ExecuteProcess(
         cmd=['true'], additional_env={'MORE': 'y', 'PYTHONPATH': '/told/so'}), context, base)
-    assert spec.environment == {'SET': 'x', 'MORE': 'y', 'PYTHONPATH': '/told/so'}
+    assert spec.environment == {'SET': 'x', 'MORE': 'y'}
     spec = convert_with(ExecuteProcess(cmd=['true'], env={'ALONE': 'z'}), context, base)
     assert spec.environment == {'ALONE': 'z'}
+
+
+@pytest.mark.parametrize('contained', [False, True])
+def test_folders_that_a_launch_file_adds_are_sent(context, prefix, contained):
+    os.environ.update(PATH='/usr/bin:/bin', LD_LIBRARY_PATH='/robot', PYTHONPATH='')
+    base = dict(os.environ)
+    SetEnvironmentVariable('LD_LIBRARY_PATH', f'{prefix}/lib/demo:/robot:').execute(context)
+    AppendEnvironmentVariable('PYTHONPATH', '/py').execute(context)
+    spec = convert_with(ExecuteProcess(
+        cmd=['true'], additional_env={'PATH': '/x:/bin'}), context, base, contained=contained)
+    # in a container, a list would replace the image's own
+    assert spec.folders == ({} if contained else {
+        'LD_LIBRARY_PATH': ({'prefix': 'demo'}, '/lib/demo'), 'PYTHONPATH': '/py', 'PATH': '/x'})
+    assert spec.environment == ({'PATH': '/x:/bin'} if contained else {})
 
 
 def test_unknown_programs(context):
@@ -206,6 +220,7 @@ def test_paths_of_a_workspace_that_a_guest_sends_are_looked_up(context, tmp_path
      ['/home/me', '/home/me/maps/a.yaml']),
     ({'environment': {'MAP': '/home/me/a b'}, 'cwd': '/home/me/run'},
      ['/home/me/a', '/home/me/run']),
+    ({'folders': {'PATH': '/bin:/home/me/bin'}}, ['/home/me/bin']),
     ({'files': {'0': ("map: '/home/me/b.pgm'", {'share': 'demo'}, '/x')}}, ['/home/me/b.pgm']),
     ({'arguments': ('/home/me/ws/install/x', 'http://host/home/me/y', ({'file': '0'},))}, []),
 ])
