@@ -358,11 +358,11 @@ class NodeSpec:
     package: str = ''
     executable: str = ''
     arguments: tuple[Text, ...] = ()
-    prefix: tuple[str, ...] = ()
+    prefix: tuple[Text, ...] = ()
     files: Mapping[str, Text] = dataclasses.field(default_factory=dict)
     environment: Mapping[str, Text] = dataclasses.field(default_factory=dict)
     folders: Mapping[str, Text] = dataclasses.field(default_factory=dict)
-    cwd: Optional[str] = None
+    cwd: Optional[Text] = None
     shell: bool = False
     passes_signals: bool = False
     emulate_tty: bool = False

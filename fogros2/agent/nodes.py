@@ -334,11 +334,12 @@ class Nodes:
         arguments = [resolve(word, files, path) for word in spec.get('arguments', [])]
         if spec.get('package'):
             arguments.insert(0, find_executable(spec['package'], spec.get('executable', ''), path))
-        prefix = list(spec.get('prefix', []))
+        prefix = [resolve(word, files, path) for word in spec.get('prefix', [])]
         if not prefix + arguments:
             raise Refused('there is nothing to run: no executable and no arguments')
         options['env'], cwd = environment, spec.get('cwd')
         if cwd is not None:
+            cwd = resolve(cwd, files, path)
             if not os.path.isdir(cwd):
                 raise Refused(f"the working directory '{cwd}' isn't there")
             options['cwd'] = cwd

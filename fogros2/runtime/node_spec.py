@@ -166,7 +166,7 @@ def from_action(
         package=package,
         executable=executable,
         arguments=tuple(arguments),
-        prefix=tuple(prefix),
+        prefix=tuple(map(texts.text, prefix)),
         files=files,
         environment={
             key: texts.text(value)
@@ -176,7 +176,7 @@ def from_action(
         folders={} if contained else {
             key: texts.text(value)
             for key, value in added_folders(description.final_env or {}, base).items()},
-        cwd=description.final_cwd,
+        cwd=None if description.final_cwd is None else texts.text(description.final_cwd),
         shell=action.shell,
         emulate_tty=_emulate_tty(action, context),
         respawn=bool(private.option(action, 'respawn')),
@@ -193,7 +193,7 @@ def robot_paths(node: NodeSpec, roots: Sequence[str], shared: Sequence[str]) -> 
 
     :param shared: folders that the machine has too.
     """
-    texts = (*node.arguments, *node.environment.values(), *node.folders.values(),
+    texts = (*node.prefix, *node.arguments, *node.environment.values(), *node.folders.values(),
              *node.files.values(), node.cwd or '')
     parts = [part for text in texts for part in ((text,) if isinstance(text, str) else text)]
     pattern = r'(?<![\w./-])(?:{})(?:/[^\s\'",;:=]*)?(?![\w.-])'.format(
@@ -264,8 +264,9 @@ class Texts:
              if workspace is None or not plan.below(prefix, [workspace])},
             key=len, reverse=True)
         self._pattern = re.compile(
-            r'(?<![\w.-])(?P<prefix>{})/(?P<kind>share|lib)/(?P<package>\w+)(?![\w.-])'.format(
-                '|'.join(re.escape(root) for root in roots) or r'(?!)'))
+            # '\n' may precede a path in a parameter file
+            r'(?<!(?<!\\)[\w.-])(?P<prefix>{})/(?P<kind>share|lib)/(?P<package>\w+)'
+            r'(?![\w.-])'.format('|'.join(re.escape(root) for root in roots) or r'(?!)'))
 
     def text(self, text: str) -> Text:
         """Return the text with markers, or the unchanged text if it needs none."""

@@ -383,7 +383,7 @@ def inside(
         arguments=(
             'sh', ({'file': _OUTER},), name, container.gpus, workspace, f'{grace:g}',
             ({'file': _INNER},), *options, image, 'sh', ({'file': _INNER},), workspace,
-            node.package, node.executable, shlex.join(node.prefix), *node.arguments))
+            node.package, node.executable, shlex.join(map(str, node.prefix)), *node.arguments))
 
 
 def remove(launch: str) -> Command:

@@ -133,6 +133,14 @@ def test_folders_come_before_the_lists_of_the_machine(
     assert variables['LD_LIBRARY_PATH'] == '/a:/b'
 
 
+def test_prefix_and_working_directory_may_have_markers(prepared: Prepared, prefix: str) -> None:
+    share = f'{prefix}/share/pack'
+    os.mkdir(share)
+    command, options = prepared(
+        prefix=['echo', [{'share': 'pack'}]], arguments=['x'], cwd=[{'share': 'pack'}])
+    assert (command, options['cwd']) == (['echo', share, 'x'], share)
+
+
 @pytest.mark.parametrize('spec, reason', [
     ({}, 'nothing to run'),
     ({'arguments': ['no-such-program']}, "'no-such-program' not found"),

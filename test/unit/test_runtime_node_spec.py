@@ -95,6 +95,14 @@ def test_prefix_and_time_outs(context):
     assert (spec.sigterm_timeout, spec.sigkill_timeout, spec.emulate_tty) == (7.0, 3.0, True)
 
 
+def test_prefix_and_working_directory_get_markers(context, prefix):
+    spec = convert(Node(
+        package='demo', executable='talker', prefix=f'gdb -x {prefix}/share/demo/gdb',
+        cwd=f'{prefix}/share/demo'), context)
+    assert spec.prefix == ('gdb', '-x', ({'share': 'demo'}, '/gdb'))
+    assert spec.cwd == ({'share': 'demo'},)
+
+
 def test_a_command(context):
     command = {'cmd': [[FindExecutable(name='sh'), ' -c true']], 'shell': True}
     spec = convert(ExecuteProcess(**command), context)
@@ -181,6 +189,7 @@ def test_paths_below_prefixes_become_markers(tmp_path):
     make_package(two, 'tools')
     texts = Texts([str(two), f'{one}/'], None)
     assert texts.text(f'{one}/share/demo') == ({'share': 'demo'},)
+    assert texts.text(rf'\n{one}/share/demo') == (r'\n', {'share': 'demo'})
     assert texts.text(f'file://{one}/share/demo/a.rviz,{two}/lib/tools/run') == (
         'file://', {'share': 'demo'}, '/a.rviz,', {'prefix': 'tools'}, '/lib/tools/run')
 
@@ -220,6 +229,7 @@ def test_paths_of_a_workspace_that_a_guest_sends_are_looked_up(context, tmp_path
      ['/home/me', '/home/me/maps/a.yaml']),
     ({'environment': {'MAP': '/home/me/a b'}, 'cwd': '/home/me/run'},
      ['/home/me/a', '/home/me/run']),
+    ({'prefix': ('gdb', '-x', '/home/me/gdb')}, ['/home/me/gdb']),
     ({'folders': {'PATH': '/bin:/home/me/bin'}}, ['/home/me/bin']),
     ({'files': {'0': ("map: '/home/me/b.pgm'", {'share': 'demo'}, '/x')}}, ['/home/me/b.pgm']),
     ({'arguments': ('/home/me/ws/install/x', 'http://host/home/me/y', ({'file': '0'},))}, []),
