@@ -45,7 +45,7 @@ def of_elements() -> None:
     """Refuse ``machine=`` of launch's elements by name, from now on."""
     import launch_ros.actions  # noqa: F401 - exposes the elements
 
-    for name in (*_NODES, 'group', 'include'):
+    for name in (*_NODES, 'executable', 'group', 'include', 'load_composable_node'):
         if name in expose.action_parse_methods:
             _replace(name, expose.action_parse_methods[name])
 

@@ -332,6 +332,8 @@ def test_machine_is_for_fogros_launch_alone(registry, tmp_path):
 @pytest.mark.parametrize(('text', 'said'), [
     ('<lifecycle_node machine="p" pkg="a" exec="b" name="c" namespace=""/>',
      'lifecycle_node takes a machine only below fogros_launch'),
+    ('<executable cmd="a" machine="p"/>', 'executable takes no machine .put it into a cloud_gro'),
+    ('<load_composable_node target="a" machine="p"/>', 'load_composable_node takes no machine'),
     ('<group machine="p"/>', 'group takes no machine .write cloud_group'),
     ('<include file="a" machine="p"/>', 'include takes no machine .put it into a cloud_group')])
 def test_element_given_a_machine_says_which_takes_one(registry, text, said):
