@@ -30,6 +30,8 @@ environment.record()
 
 #: ROS arguments followed by a file name; the file is sent to the machine.
 _FILE_ARGUMENTS = ('--params-file', '--log-config-file')
+#: Folders whose files any machine has, or a package installs.
+_SYSTEM = ('/bin', '/dev', '/etc', '/lib', '/opt/ros', '/proc', '/sbin', '/sys', '/usr')
 
 
 class ProgramName(Substitution):
@@ -189,17 +191,19 @@ def from_action(
 
 def robot_paths(node: NodeSpec, roots: Sequence[str], shared: Sequence[str]) -> list[str]:
     """
-    Return the paths below some folders of the robot that a node gets, such as ``$(env HOME)``.
+    Return the paths of the robot that a node gets: below folders, or of files outside the system.
 
+    :param roots: the folders, such as ``$(env HOME)``.
     :param shared: folders that the machine has too.
     """
     texts = (*node.prefix, *node.arguments, *node.environment.values(), *node.folders.values(),
              *node.files.values(), node.cwd or '')
     parts = [part for text in texts for part in ((text,) if isinstance(text, str) else text)]
-    pattern = r'(?<![\w./-])(?:{})(?:/[^\s\'",;:=]*)?(?![\w.-])'.format(
-        '|'.join(re.escape(root.rstrip('/')) for root in roots if root.strip('/')) or '(?!)')
-    return sorted({path for part in parts if isinstance(part, str)
-                   for path in re.findall(pattern, part) if not plan.below(path, shared)})
+    paths = {path for part in parts if isinstance(part, str)
+             for path in re.findall(r'(?<![\w./-])/[^\s\'",;:=]+', part)}
+    roots = [root.rstrip('/') for root in roots if root.strip('/')]
+    return sorted(path for path in paths if not plan.below(path, shared) and (
+        plan.below(path, roots) or os.path.isfile(path) and not plan.below(path, _SYSTEM)))
 
 
 def full_name(node: NodeSpec) -> str:

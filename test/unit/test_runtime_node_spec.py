@@ -230,6 +230,7 @@ def test_paths_of_a_workspace_that_a_guest_sends_are_looked_up(context, tmp_path
     ({'environment': {'MAP': '/home/me/a b'}, 'cwd': '/home/me/run'},
      ['/home/me/a', '/home/me/run']),
     ({'prefix': ('gdb', '-x', '/home/me/gdb')}, ['/home/me/gdb']),
+    ({'arguments': (f'file:={__file__}', f'{__file__}.new', '/usr/bin/env')}, [__file__]),
     ({'folders': {'PATH': '/bin:/home/me/bin'}}, ['/home/me/bin']),
     ({'files': {'0': ("map: '/home/me/b.pgm'", {'share': 'demo'}, '/x')}}, ['/home/me/b.pgm']),
     ({'arguments': ('/home/me/ws/install/x', 'http://host/home/me/y', ({'file': '0'},))}, []),
