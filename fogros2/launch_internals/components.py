@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
+from pathlib import Path
 from typing import Any, Optional
 
 from launch import Action, LaunchContext, LaunchDescriptionEntity
@@ -18,8 +19,22 @@ _REMAPS, _NAMESPACE = 'ros_remaps', 'ros_namespace'
 
 def of(action: Any) -> list[Any]:
     """Return the descriptions of the nodes that a LoadComposableNodes loads."""
-    nodes: list[Any] = list(vars(action)['_LoadComposableNodes__composable_node_descriptions'])
-    return nodes
+    return list(vars(action).get('_LoadComposableNodes__composable_node_descriptions', ()))
+
+
+def _loaded(action: Any, context: LaunchContext) -> list[Any]:
+    return [component for component in of(action)
+            if component.condition() is None or component.condition().evaluate(context)]
+
+
+def parameters(action: Any, context: LaunchContext) -> Iterator[tuple[str, list[str]]]:
+    """Yield the name of each component that is loaded, and texts with its parameters."""
+    from launch_ros.utilities import evaluate_parameters
+    for component in _loaded(action, context):
+        given = evaluate_parameters(context, component.parameters or ())
+        yield perform_substitutions(context, component.node_name or component.node_plugin), [
+            one.read_text(errors='replace') if isinstance(one, Path) and one.is_file()
+            else str(one) for one in given]
 
 
 def set_remappings(component: Any, rules: Any) -> None:
@@ -70,8 +85,7 @@ def _renamed(
         return
     configurations = context.launch_configurations
     group: Optional[list[tuple[str, str]]] = configurations.get(_REMAPS)
-    components = [component for component in of(action)
-                  if component.condition() is None or component.condition().evaluate(context)]
+    components = _loaded(action, context)
     # in Jazzy these are generators, which can be read only once
     before = [None if component.remappings is None else list(component.remappings)
               for component in components]

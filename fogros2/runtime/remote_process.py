@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import dataclasses
 import functools
 from typing import Any, cast, Optional, TYPE_CHECKING
@@ -100,13 +100,8 @@ class RemoteProcess:
         if not isinstance(action, AddedProcess):
             if self.needed:
                 session.need(self._node.name)
-            paths = node_spec.robot_paths(
-                self._node, [context.environment.get('HOME', ''), *(plan.ament_prefixes(
-                    coordinator.base_environment) if contained else ())],
-                session.spec.workspaces)
-            shared = provider.shared_folders(session.spec) if paths else ()
-            session.warn_of_paths(
-                self._node, [path for path in paths if not plan.below(path, shared)])
+            _warn_of_paths(coordinator, session, self._node, plan.ament_prefixes(
+                coordinator.base_environment) if contained else ())
         for each, own in feature.used(session.spec):
             each.check_node(session.spec, self._node, own)
         if not (contained or isinstance(action, AddedProcess)):
@@ -238,7 +233,28 @@ def send_components(
         return
     coordinator = Coordinator.of(context)
     session = None if coordinator.on_robot(machine) else coordinator.session(machine)
+
+    def beside() -> list[ExecuteLocal]:
+        if session is not None:
+            for name, texts in components.parameters(entity, context):
+                _warn_of_paths(coordinator, session, NodeSpec('', name, arguments=tuple(texts)))
+        return coordinator.beside(own, session, process_on)
+
     components.rename_topics(
         entity, lambda: {} if session is None or session.interrupted else coordinator.parts.names(
-            session.spec.name),
-        lambda: coordinator.beside(own, session, process_on))
+            session.spec.name), beside)
+
+
+def _warn_of_paths(
+    coordinator: Coordinator, session: Session, node: NodeSpec, more: Sequence[str] = (),
+) -> None:
+    """
+    Warn of paths of the robot that a node gets, which its machine may not have.
+
+    :param more: folders beside the home folder.
+    """
+    home = coordinator.context.environment.get('HOME', '')
+    paths = node_spec.robot_paths(node, [home, *more], session.spec.workspaces)
+    shared = coordinator.launch.provider(session.spec.provider).shared_folders(
+        session.spec) if paths else ()
+    session.warn_of_paths(node, [path for path in paths if not plan.below(path, shared)])

@@ -16,6 +16,7 @@ from launch.actions import (
     RegisterEventHandler,
     TimerAction,
 )
+from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessStart
 from launch.events import matches_action
 from launch.events.process import ShutdownProcess
@@ -386,3 +387,22 @@ def test_home_of_the_robot_is_mentioned_once(run, fake, planner, monkeypatch, ca
     said = capfd.readouterr().out
     assert said.count('/home/me of this robot, as launch resolves $(env HOME)') == 1
     assert 'name a path of the machine' in said
+
+
+def test_home_of_the_robot_in_a_component_is_mentioned(
+        run, fake, planner, monkeypatch, capfd, tmp_path):
+    monkeypatch.setenv('HOME', '/home/me')
+    monkeypatch.setattr(launch_ros.actions.LoadComposableNodes, 'execute', lambda *_: None)
+    (tmp_path / 'p.yaml').write_text('/**:\n  ros__parameters:\n    a: /home/me/b\n')
+    fake.on_start = ends
+    some = [ComposableNode(
+        package='demo', plugin='demo::Map', name=name, condition=IfCondition(loaded),
+        parameters=[str(tmp_path / 'p.yaml'), {'map': [EnvironmentVariable('HOME'), '/', name]}])
+        for name, loaded in (('one', 'true'), ('two', 'false'))]
+    assert run(LaunchDescription([CloudGroup(planner, [
+        launch_ros.actions.Node(package='demo', executable='talker', name='box'),
+        launch_ros.actions.LoadComposableNodes(
+            target_container='/box', composable_node_descriptions=some)])])) == 0
+    said = capfd.readouterr().out
+    assert 'planner: one gets /home/me/b, /home/me/one of this robot' in said
+    assert 'two' not in said
