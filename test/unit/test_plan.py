@@ -107,7 +107,7 @@ def test_underlay_has_ros_and_the_workspace_only():
         'PYTHONPATH': '/home/me/ws/install/a/lib/python3:/home/me/own:/opt/ros/jazzy/lib/python3',
         'LD_LIBRARY_PATH': '/opt/ros/jazzy/lib:/usr/local/cuda/lib',
         'PATH': '/home/me/bin:/opt/ros/jazzy/bin:/usr/bin',
-        'ROS_DISTRO': 'jazzy', 'ROS_DOMAIN_ID': '7', 'AWS_SECRET_ACCESS_KEY': 'x',
+        'ROS_DISTRO': 'jazzy', 'RCUTILS_LOGGING_USE_STDOUT': '1', 'AWS_SECRET_ACCESS_KEY': 'x',
     }
     under = plan.underlay(environment, ['/home/me/ws'], '/opt/ros/jazzy/bin/ros2', prefix='/usr')
     assert under.prefixes == ('/opt/ros/jazzy',)
@@ -116,7 +116,7 @@ def test_underlay_has_ros_and_the_workspace_only():
         'PYTHONPATH': '/home/me/ws/install/a/lib/python3:/opt/ros/jazzy/lib/python3',
         'LD_LIBRARY_PATH': '/opt/ros/jazzy/lib',
         'PATH': f'/opt/ros/jazzy/bin:{plan.SYSTEM_PATH}',
-        'ROS_DISTRO': 'jazzy', 'ROS_DOMAIN_ID': '7',
+        'ROS_DISTRO': 'jazzy', 'RCUTILS_LOGGING_USE_STDOUT': '1',
     }
 
 
