@@ -43,7 +43,8 @@ def generate_launch_description():
                                  StreamTopic('/annotated', 'h264', 'to_robot')]),
         CloudNode(machine=machine, package='fogros2_examples', executable='talker'),
         CloudGroup(machine=machine, actions=[ExecuteProcess(cmd=['echo', {markup!r}])]),
-        Node(package='fogros2_examples', executable='camera'),
+        Node(package='fogros2_examples', executable='camera',
+             parameters=[{{'width': 320, 'height': 240, 'rate': 10.0}}]),
         Node(package='fogros2_examples', executable='listener'),
     ])
 """
@@ -188,7 +189,7 @@ def pictures_move(browser: Browser) -> None:
     def moved() -> bool:
         for topic, shots in seen.items():
             at = f'document.querySelector(\'figure[data-topic="{topic}"] img\')'
-            shot = browser.ask(f'{at} && {at}.complete && {at}.naturalWidth === 640 && {at}.src')
+            shot = browser.ask(f'{at} && {at}.complete && {at}.naturalWidth === 320 && {at}.src')
             if shot:
                 shots.add(shot)
         return all(len(shots) >= 3 for shots in seen.values())

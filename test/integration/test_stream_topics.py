@@ -49,7 +49,8 @@ def generate_launch_description():
                       stream_topics=[('/front/camera', 'h264'),
                                      StreamTopic('/seen', 'h264', 'to_robot')]),
         ]),
-        Node(package='fogros2_examples', executable='camera', namespace='front'),
+        Node(package='fogros2_examples', executable='camera', namespace='front',
+             parameters=[{{'width': 320, 'height': 240}}]),
         CloudNode(machine=machine, package='fogros2_examples', executable='obstacle_finder',
                   stream_topics=[
                       StreamTopic('/points', 'pointcloud', resolution=0.01,
@@ -149,7 +150,8 @@ def generate_launch_description():
                   name='middle', remappings=[('camera', '/front/camera'),
                                              ('annotated', '/between')],
                   output='screen', stream_topics=[('/front/camera', 'h264')]),
-        Node(package='fogros2_examples', executable='camera', namespace='front'),
+        Node(package='fogros2_examples', executable='camera', namespace='front',
+             parameters=[{{'width': 320, 'height': 240, 'rate': 15.0}}]),
     ])
 """
 
@@ -193,12 +195,12 @@ def test_streams_cross_encoded(tmp_path: Path, cloud_network: str) -> None:
     said = re.search(r'viewer says (.*)', launched.text)
     assert said, launched.text
     found = json.loads(said[1])
-    assert found['kinds'] == [['camera', 'bgr8', 480, 640, 1920, 640 * 480 * 3]]
+    assert found['kinds'] == [['camera', 'bgr8', 240, 320, 960, 320 * 240 * 3]]
     # of some the viewer here lost the raw one, as its QoS allows
     assert found['same'] and found['both'] >= 10, found
     assert no_node_failed(launched), launched.text
-    # one raw image a direction would be 1.8 MB, one raw scan 360 kB
-    assert 0 < found['traffic'] < found['seen'] * 200_000 + found['obstacles'] * 120_000, found
+    # one raw image a direction would be 460 kB, one raw scan 360 kB
+    assert 0 < found['traffic'] < found['seen'] * 100_000 + found['obstacles'] * 120_000, found
     clouds = found['clouds']
     assert clouds['both'] >= 5 and clouds['points'] > 0, clouds
     # the resolution of the first stream, and the coarsest one, of a busy computer; the second

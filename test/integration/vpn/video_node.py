@@ -3,8 +3,8 @@
 """
 The ends of a video stream for tests: ``camera`` publishes images, ``viewer`` takes them.
 
-With ``best_effort`` behind it the viewer takes the camera's own images, at 10 Hz. A topic behind
-it, such as /left, replaces /camera, and /seen/left replaces /seen.
+With ``best_effort`` behind it the viewer takes the camera's own images, larger and at 10 Hz. A
+topic behind it, such as /left, replaces /camera, and /seen/left replaces /seen.
 
 The viewer prints a JSON object an image: its number, latency and arrival (s, on the monotonic
 clock that all network namespaces share), and for some how near it is to the original (dB).
@@ -24,7 +24,7 @@ from sensor_msgs.msg import Image
 
 from fogros2_examples.scene import Scene
 
-WIDTH, HEIGHT, FRAMES, RATE = 640, 480, 40, 30.0
+WIDTH, HEIGHT, FRAMES, RATE = 320, 240, 40, 30.0
 COMPARED = 7
 
 
@@ -35,9 +35,10 @@ def frame(frames: list[numpy.ndarray], number: int) -> numpy.ndarray:
 
 
 def main() -> None:
-    scene = Scene(WIDTH, HEIGHT, RATE)
-    frames = [scene.frame(number) for number in range(FRAMES)]
     raw = sys.argv[2:] == ['best_effort']
+    width, height = (2 * WIDTH, 2 * HEIGHT) if raw else (WIDTH, HEIGHT)
+    scene = Scene(width, height, RATE)
+    frames = [scene.frame(number) for number in range(FRAMES)]
     topic = next((word for word in sys.argv[2:] if word.startswith('/')), None)
     qos = qos_profile_sensor_data if raw else 2
     rclpy.init(args=[])
@@ -46,7 +47,7 @@ def main() -> None:
 
     def shoot() -> None:
         nonlocal count
-        image = Image(width=WIDTH, height=HEIGHT, encoding='bgr8', step=3 * WIDTH)
+        image = Image(width=width, height=height, encoding='bgr8', step=3 * width)
         image.data = array.array('B', frame(frames, count).tobytes())
         image.header.frame_id = f'{count} {time.monotonic()!r}'
         publisher.publish(image)
@@ -57,7 +58,7 @@ def main() -> None:
         number, sent = image.header.frame_id.split()
         told = {'image': int(number), 'latency': arrival - float(sent), 'arrival': arrival}
         if int(number) % COMPARED == 0:
-            pixels = numpy.frombuffer(image.data, numpy.uint8).reshape(HEIGHT, WIDTH, 3)
+            pixels = numpy.frombuffer(image.data, numpy.uint8).reshape(height, width, 3)
             error = ((pixels.astype(int) - frame(frames, int(number))) ** 2).mean()
             told['psnr'] = 10 * math.log10(255 ** 2 / max(error, 1e-9))
         print(json.dumps(told), flush=True)
