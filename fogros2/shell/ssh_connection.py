@@ -11,9 +11,10 @@ import logging
 import os
 from pathlib import Path
 import socket
+import sys
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 import warnings
 
 from fogros2.errors import AuthenticationError, ConnectError, HostKeyError, PrerequisiteError
@@ -78,7 +79,12 @@ def _import() -> None:
     with _IMPORT, warnings.catch_warnings():
         # the paramiko of Ubuntu 24.04 names a cipher of which a newer cryptography warns the user
         warnings.simplefilter('ignore')
+        # it takes 40 % of paramiko's import, for the settings that ssh itself reads for us
+        modules: dict[str, Any] = sys.modules
+        unused = modules.setdefault('invoke', None) is None
         import paramiko
+        if unused:
+            del modules['invoke']
     # paramiko's threads log errors that we raise; without a handler, Python would print them.
     logger = logging.getLogger(paramiko.__name__)
     if logger.level == logging.NOTSET:

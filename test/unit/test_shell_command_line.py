@@ -101,13 +101,14 @@ def test_common_failures_have_a_hint(code, stderr, words):
     assert words in hint if words else not hint
 
 
-def test_paramiko_is_imported_late():
+def test_paramiko_is_imported_late_and_without_invoke():
     code = (
         'import sys\n'
         'from fogros2.shell import ssh, ssh_connection\n'
         "assert 'paramiko' not in sys.modules\n"
         'ssh_connection.warm().join()\n'
-        "assert 'paramiko' in sys.modules\n")
+        "assert 'paramiko' in sys.modules and 'invoke' not in sys.modules\n"
+        'import invoke\n')
     subprocess.run([sys.executable, '-c', code], check=True)
 
 
