@@ -7,6 +7,7 @@ from collections.abc import Callable
 import contextlib
 import itertools
 import math
+import queue
 import threading
 import time
 from typing import Any, cast, Literal, Optional
@@ -55,9 +56,10 @@ class AgentClient:
     """
     A connection to a machine's agent that reconnects after a loss.
 
-    One thread reads, and checks each message against ``fogros2.events``. It passes each event to
-    the subscriber, once and in order, and adds ``ConnectionChanged`` and ``Gap``. It gives up an
-    agent that sends an invalid message, as one that is gone.
+    One thread writes, as a machine may take nothing. Another reads, and checks each message
+    against ``fogros2.events``. It passes each event to the subscriber, once and in order, and adds
+    ``ConnectionChanged`` and ``Gap``. It gives up an agent that sends an invalid message, as one
+    that is gone.
     The subscriber must not make requests: its own thread would have to read their replies.
 
     :param shell: reaches the machine.
@@ -74,10 +76,9 @@ class AgentClient:
         self._callback: Optional[EventCallback] = None
         self._closed = threading.Event()
         self._lock = threading.Lock()
-        self._writing = threading.Lock()
+        #: Lines to write, each with its connection; None ends the writing thread.
+        self._lines: queue.SimpleQueue[Optional[tuple[Stream, bytes]]] = queue.SimpleQueue()
         self._heard = 0.0
-        #: Seconds in which the link took pieces of long requests.
-        self._sending = 0.0
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
         self._stream: Optional[Stream] = None
@@ -117,6 +118,8 @@ class AgentClient:
             self._thread = threading.Thread(
                 target=self._read_all, name='fogros2-agent', daemon=True)
             self._thread.start()
+            threading.Thread(
+                target=self._write_all, name='fogros2-agent-write', daemon=True).start()
             Periodic('fogros2-agent-watch', SILENCE / 4, self._watch, stop=self._closed)
 
     def request(
@@ -129,8 +132,8 @@ class AgentClient:
         If the connection breaks, the client reconnects and repeats the request, except ``signal``,
         which would take effect twice.
 
-        :param timeout: seconds, including the time of lost connections, but not the time in which
-            the link takes long requests.
+        :param timeout: seconds, including the time of lost connections. A long request gets
+            ``SILENCE / 4`` more for each ``PIECE``.
         :param silent: seconds without any data after which the request fails earlier; must be more
             than half of ``SILENCE``, because a busy agent still answers pings. An absent agent
             then gets ``PATIENCE`` seconds instead of ``RESTART``.
@@ -149,15 +152,16 @@ class AgentClient:
             self._pending[number] = pending
             stream = self._stream
         if stream is not None:
-            self._send(stream, line)
-        begin = self._clock()
-        deadline = begin + timeout
+            self._lines.put((stream, line))
+        begin = time.monotonic()
+        deadline = begin + timeout + len(line) // PIECE * SILENCE / 4
         try:
-            while not pending.done.wait(min(0.1, max(0.0, deadline - self._clock()))):
-                if self._clock() >= deadline:
+            while not pending.done.wait(min(0.1, max(0.0, deadline - time.monotonic()))):
+                if time.monotonic() >= deadline:
                     raise DeadlineExceeded(
                         f"the agent didn't answer '{command}' within {timeout:g} s")
-                if silent is not None and min(self.silent_for, self._clock() - begin) > silent:
+                if silent is not None and min(
+                        self.silent_for, time.monotonic() - begin) > silent:
                     raise DeadlineExceeded(
                         f"the agent sent nothing for {silent:g} s and didn't answer '{command}'")
                 absent_since = self._absent_since
@@ -225,6 +229,7 @@ class AgentClient:
                 if self._stream is None:
                     break
         finally:
+            self._lines.put(None)
             error = self._error or AgentError('the connection to the agent was closed')
             with self._lock:
                 self._error = error
@@ -326,23 +331,22 @@ class AgentClient:
 
     def _follow_on(self, stream: Stream) -> None:
         self._log_request = next(self._numbers)
-        self._send(stream, to_json({
+        self._lines.put((stream, to_json({
             'id': self._log_request, 'command': 'log', 'from': self._next,
-        }).encode() + b'\n')
+        }).encode() + b'\n'))
 
-    def _send(self, stream: Stream, line: bytes) -> None:
-        """Write a line; after a connection error the reading thread repeats the requests."""
-        with self._writing, contextlib.suppress(ConnectError):
-            for position in range(0, len(line), PIECE):
-                begin = time.monotonic()
-                stream.write(line[position:position + PIECE])
-                if position > 0:  # a single piece may wait in the buffers of a dead connection
-                    self._heard = time.monotonic()
-                    self._sending += self._heard - begin
-
-    def _clock(self) -> float:
-        """Return a monotonic time in seconds that stands still while the link takes pieces."""
-        return time.monotonic() - self._sending
+    def _write_all(self) -> None:
+        while (item := self._lines.get()) is not None:
+            stream, line = item
+            # after an error of the connection, the reading thread repeats the requests
+            with contextlib.suppress(FogError):
+                for position in range(0, len(line), PIECE):
+                    begin = time.monotonic()
+                    stream.write(line[position:position + PIECE])
+                    now = time.monotonic()
+                    # a single piece may wait in the buffers of a dead connection
+                    if position > 0 and now - begin < SILENCE / 4:
+                        self._heard = now
 
     def _watch(self) -> None:
         """Ping a silent connection, and close it if nothing comes back."""
@@ -351,10 +355,8 @@ class AgentClient:
             return
         if silent > SILENCE:
             stream.close()
-        elif self._writing.acquire(timeout=SILENCE / 4):
-            # a thread that holds the lock for longer is stuck in a dead connection
-            self._writing.release()
-            self._send(stream, _PING)
+        elif self._lines.empty():  # else the connection takes nothing
+            self._lines.put((stream, _PING))
 
     def _reopen(self) -> None:
         """Reconnect, with increasing pauses, until the client is closed."""
@@ -389,7 +391,7 @@ class AgentClient:
         if self._next is not None:
             self._follow_on(stream)
         for line in (_PING, *again):
-            self._send(stream, line)
+            self._lines.put((stream, line))
 
 
 def _parsed(line: bytes) -> dict[str, Any]:

@@ -67,6 +67,7 @@ def followed(client: AgentClient) -> list[dict[str, Any]]:
     """Subscribe to the events of an agent; return them as they come."""
     seen: list[Any] = []
     client.subscribe(seen.append, since=1)
+    until(lambda: client._shell.opened[0].asked)
     return seen
 
 
@@ -100,7 +101,7 @@ def test_ping_before_the_subscription_does_not_replace_it(make):
     # answered in order, so the ping's answer has been read
     client.request('configure')
     client.subscribe(lambda event: None, since=1)
-    assert any(request['command'] == 'log' for request in stream.asked)
+    until(lambda: any(request['command'] == 'log' for request in stream.asked))
 
 
 def test_refusal_carries_its_hint(make):
@@ -317,6 +318,46 @@ def test_long_request_passes_a_slow_link_also_again(make):
     client = make(breaking, SlowStream(lambda request: [done(request, known=[])]), silence=1.5)
     client.request('start', nodes='x' * 400_000, timeout=1.5)
     assert len(client._shell.opened) == 2
+
+
+class FullStream(ScriptedStream):
+    """An agent of a hijacked machine that talks, but takes nothing, or long requests slowly."""
+
+    def __init__(self, pause: float) -> None:
+        super().__init__(lambda request: [])
+        self.pause = pause
+        self.closed = threading.Event()
+
+    def write(self, data: bytes) -> None:
+        if self.closed.wait(self.pause):
+            raise ConnectError('closed')
+
+    def readline(self) -> bytes:
+        return b'' if self.closed.wait(0.05) else b'{"event": "x"}\n'
+
+    def close(self) -> None:
+        self.closed.set()
+
+
+@pytest.mark.parametrize('pause', [None, 0.2])
+def test_machine_that_takes_nothing_holds_no_request(make, pause):
+    client = make(FullStream(pause), silence=1.0)
+    long = in_thread(lambda: client.request('start', nodes='x' * 200_000))
+    until(lambda: client._pending)
+    for _ in range(2):
+        ending = in_thread(lambda: client.request('stop', timeout=0.1, silent=5.0))
+        with pytest.raises(DeadlineExceeded, match="didn't answer 'stop'"):
+            ending.result(2.0)
+    client.close()
+    with pytest.raises(AgentError, match='was closed'):
+        long.result(2.0)
+
+
+def test_long_request_ends_on_a_link_that_is_too_slow(make):
+    client = make(FullStream(0.2), silence=0.4)
+    with pytest.raises(DeadlineExceeded, match="didn't answer 'start'"):
+        in_thread(lambda: client.request(
+            'start', nodes='x' * 3 * connection.PIECE, timeout=0.1)).result(2.0)
 
 
 #: Messages of a hijacked machine, and the field of each that is wrong; test_untrusted.py has more.
