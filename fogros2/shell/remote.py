@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 #: Seconds to wait for further output after a command's end, as its children may still write.
 _DRAIN = 2.0
-#: Largest input in bytes that fits into a channel's window, and needs no thread.
-_INLINE = 1 << 16
 
 #: A connection with many channels.
 Link = TypeVar('Link', 'paramiko.Transport', 'multiplexed.Link')
@@ -245,7 +243,9 @@ class RemoteShell(sync.RsyncShell, Generic[Link]):
     def open(self, command: Command) -> Stream:
         """Start a program on the machine; closing the returned stream ends the program."""
         channel = self.start(command_line.quiet(command))
-        _feed(channel, command.input, end=False)
+        feeder = _feed(channel, command.input, end=False)
+        if feeder is not None:
+            feeder.join(self._timeout)
         channel.settimeout(None)
         return LineStream(channel, self.name)
 
@@ -273,7 +273,7 @@ def _feed(channel: Channel, data: bytes, *, end: bool = True) -> Optional[thread
             if end:
                 channel.shutdown_write()
 
-    if len(data) <= _INLINE:
+    if not data:
         send()
         return None
     thread = threading.Thread(target=send, name='fog-feed', daemon=True)

@@ -13,10 +13,12 @@ import threading
 import paramiko
 import pytest
 
-from fogros2.errors import ConnectError
-from fogros2.model import Command
+from fogros2.errors import ConnectError, DeadlineExceeded
+from fogros2.model import Command, Endpoint
 from fogros2.shell import multiplexed
 from fogros2.shell import multiplexer as mux
+from fogros2.shell.remote import MultiplexedShell
+from fogros2.waiting import in_thread
 from rigs.memory import measure
 
 LIMIT = 100e6
@@ -200,3 +202,19 @@ def test_odd_frame_ends_the_connection_with_one_error(
     with pytest.raises(ConnectError, match="the connection to 'planner' was lost: "):
         link.open(Command(('true',)))
     assert not link.is_alive()
+
+
+def test_machine_that_takes_no_input_holds_no_command(
+    linked: tuple[multiplexed.Link, socket.socket], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mux, 'CREDIT', 100)
+    link, _ = linked
+
+    class Shell(MultiplexedShell):
+        def _connect(self, *args: object) -> multiplexed.Link:
+            return link
+
+    shell = Shell(Endpoint('guest'), name='planner')
+    begun = in_thread(lambda: shell.run(Command(('cat',), input=bytes(200)), timeout=0.1))
+    with pytest.raises(DeadlineExceeded, match="cat took too long on 'planner'"):
+        begun.result(5.0)
