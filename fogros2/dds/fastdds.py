@@ -36,6 +36,7 @@ from xml.etree.ElementTree import Element
 from fogros2.dds import addresses_of, check_discovery, DdsVendor, local_only, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
+from fogros2.store import check_owner
 from fogros2.vpn.addresses import dds_ports, DISCOVERY_GROUP, multicast_group
 
 #: Environment variable with the path of Fast DDS's profiles.
@@ -241,10 +242,15 @@ class FastDds(DdsVendor):
 
 
 def _file(user: Mapping[str, str]) -> str:
-    """Return the path of the user's profiles, '' without any; machines have no user."""
+    """
+    Return the path of the user's profiles, '' without any; machines have no user.
+
+    :raises StoreError: the file in the working directory belongs to another account.
+    """
     if user.get(VARIABLE) or not user or user.get('SKIP_DEFAULT_XML_FILE') == '1':
         return user.get(VARIABLE, '')
-    return DEFAULT_FILE if Path(DEFAULT_FILE).exists() else ''
+    path = Path(DEFAULT_FILE).absolute()
+    return str(check_owner(path)) if path.is_file() else ''
 
 
 def _profiles(path: str) -> tuple[Element, Element]:

@@ -158,8 +158,9 @@ def fetch(
         file.flush()
         try:
             process.run(Command((
-                sys.executable, '-m', 'pip', 'download', '--quiet', '--disable-pip-version-check',
-                *locked.OPTIONS, *(('--no-index', '--find-links', source) if source else ()),
+                sys.executable, '-c', _RUN_PIP, 'download', '--quiet',
+                '--disable-pip-version-check', *locked.OPTIONS,
+                *(('--no-index', '--find-links', source) if source else ()),
                 '--find-links', str(target), '--dest', str(target),
                 '--python-version', version, '--implementation', 'cp', '--abi', f'cp{version}',
                 '--abi', 'abi3', '--abi', 'none',
@@ -175,6 +176,9 @@ def fetch(
     return target
 
 
+#: Without the current folder: it may have modules of other accounts.
+_RUN_PIP = ('import sys; sys.path[:] = filter(None, sys.path); import runpy; '
+            "runpy.run_module('pip', run_name='__main__', alter_sys=True)")
 #: Platforms of wheels that a machine can use, see ``bootstrap.WHEELS_LIBC``.
 _PLATFORMS = ('manylinux_2_28_x86_64', 'manylinux_2_27_x86_64', 'manylinux_2_24_x86_64',
               'manylinux_2_17_x86_64', 'manylinux2014_x86_64', 'manylinux_2_12_x86_64',

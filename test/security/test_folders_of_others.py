@@ -10,11 +10,13 @@ from pathlib import Path
 
 import pytest
 
+from fogros2.dds.fastdds import DEFAULT_FILE, FastDds
 from fogros2.describe import defaults
-from fogros2.errors import StoreError
+from fogros2.errors import PrerequisiteError, StoreError
 from fogros2.host import wheels
 from fogros2.provider.container import debian_root
 from fogros2.store import state_home, Store
+from fogros2.waiting import in_thread
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason='gives files to other accounts')
 
@@ -77,3 +79,35 @@ def test_defaults_of_another_account_are_refused(shared: Path) -> None:
     os.chown(file, FRIEND, FRIEND)
     os.chown(shared, FRIEND, FRIEND)
     defaults.check(environment)
+
+
+def test_profile_of_another_account_is_refused(
+    shared: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(shared)
+    file = shared / DEFAULT_FILE
+    file.write_text('<dds><address>203.0.113.66</address></dds>')
+    assert FastDds().asked({'HOME': '/root'}) == ['203.0.113.66']
+    os.chown(file, STRANGER, STRANGER)
+    with pytest.raises(StoreError, match=f'{file} belongs to another account'):
+        FastDds().asked({'HOME': '/root'})
+
+
+def test_pipe_of_another_account_is_no_profile(
+    shared: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(shared)
+    os.mkfifo(DEFAULT_FILE)
+    os.chown(DEFAULT_FILE, STRANGER, STRANGER)
+    assert in_thread(lambda: FastDds().asked({'HOME': '/root'})).result(10.0) == []
+
+
+def test_pip_of_another_account_does_not_run(
+    shared: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(shared)
+    monkeypatch.setenv('FOGROS2_WHEELS', str(shared / 'none'))
+    (shared / 'pip.py').write_text(f'open({str(shared / "attacked")!r}, "w")')
+    with pytest.raises(PrerequisiteError, match='numpy'):
+        wheels.fetch(['numpy'], (3, 13), timeout=60.0, folder=shared / 'cache')
+    assert not (shared / 'attacked').exists()
