@@ -38,6 +38,7 @@ from fogros2.errors import (
     DdsError,
     FogError,
     MachineNotFound,
+    PrerequisiteError,
     StoreError,
 )
 from fogros2.feature import Cost
@@ -307,7 +308,10 @@ class Launch:
 
     def programs(self) -> Optional[Path]:
         """Return the folder to put first into PATH of the robot's processes, None for none."""
-        return ros2_daemon.programs(self.store.launch_folder(self.id))
+        # a launch itself needs no daemon, and another account may have taken all ports
+        with contextlib.suppress(PrerequisiteError):
+            return ros2_daemon.programs(self.store.launch_folder(self.id))
+        return None
 
     def _write_interfaces(self) -> None:
         """Write the middleware's configuration for nodes of the robot that start from now on."""

@@ -24,10 +24,10 @@ import urllib.parse
 
 import pytest
 
-from fogros2 import process
+from fogros2 import process, ros2_daemon
 from fogros2.model import Command
 from fogros2.shell import relay
-from fogros2.waiting import wait_until
+from fogros2.waiting import in_thread, wait_until
 from fogros2_features.guests.program import Door
 from fogros2_monitor import accounts, request
 from fogros2_monitor.browser import Ticket
@@ -186,6 +186,20 @@ while True:
     link, _ = listener.accept()
     link.sendall(b'HTTP/1.1 200 OK\\r\\n\\r\\nof another account')
     link.close()
+"""
+#: Answers at a port of the loopback, which it prints, without end.
+FLOOD = """\
+import socket
+listener = socket.create_server(('127.0.0.1', 0))
+print(listener.getsockname()[1], flush=True)
+while True:
+    link, _ = listener.accept()
+    try:
+        link.sendall(b'HTTP/1.1 200 OK\\r\\nTransfer-Encoding: chunked\\r\\n\\r\\n')
+        while True:
+            link.sendall(b'1\\r\\nx\\r\\n')
+    except OSError:
+        pass
 """
 #: Opens a connection, and closes its socket at once.
 LEAVE = """\
@@ -356,6 +370,14 @@ def test_no_account_gets_the_page_of_a_browser(root: None) -> None:
         with contextlib.closing(http.client.HTTPConnection(place.netloc, timeout=60)) as own:
             own.request('GET', place.path)
             assert own.getresponse().getheader('Location') == 'http://127.0.0.1:9/#token'
+
+
+def test_no_account_stands_for_the_daemon_of_ros2(root: None, tmp_path: Path) -> None:
+    """It listens at the port that a launch has chosen for its daemon."""
+    with stranger(FLOOD) as child:
+        assert child.stdout
+        (tmp_path / ros2_daemon.PORT_FILE).write_bytes(child.stdout.readline())
+        in_thread(lambda: ros2_daemon.stop(tmp_path)).result(3.0)
 
 
 def unowned(link: socket.socket) -> bool:

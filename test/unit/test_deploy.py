@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from fogros2 import plan, process
+from fogros2 import plan, process, ros2_daemon
 from fogros2.agent_client import agent_program, AgentClient
 from fogros2.dds import Router
 from fogros2.dds.zenoh import Zenoh
@@ -161,6 +161,14 @@ def test_filter_drops_dds_of_other_domains(launch, monkeypatch, dds, environment
     launch.user_environment['ROS_DOMAIN_ID'] = '3'
     launch.use_dds(dds)
     assert launch.drops(environment) == drops
+
+
+def test_launch_without_a_port_for_a_daemon_of_ros2_begins(launch, monkeypatch):
+    def none(folder):
+        raise PrerequisiteError('no TCP port is free')
+
+    monkeypatch.setattr(ros2_daemon, 'programs', none)
+    assert launch.programs() is None
 
 
 def test_computer_of_the_user_cannot_be_stopped(launch, checked, monkeypatch):
