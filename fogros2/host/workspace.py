@@ -68,7 +68,20 @@ _AS_ROOT = """\
     "workspace at another path" >&2; exit 1; }
 umask 022
 mkdir -p "$1"
-chown "$2" "$1"
+chown -h "$2" "$1"
+"""
+# Refuse a path at which another account may put folders of its own: $1.
+_OF_OTHERS = """\
+path=$1
+while :; do
+    for owner in $(stat -c %u "$path" 2>/dev/null; stat -Lc %u "$path" 2>/dev/null); do
+        [ "$owner" = 0 ] || [ "$owner" = "$(id -u)" ] || {
+            echo "$path belongs to another account: use another login user, or a workspace at" \
+                "another path" >&2; exit 1; }
+    done
+    [ "$path" != / ] || break
+    path=$(dirname "$path")
+done
 """
 
 
@@ -327,7 +340,7 @@ def no_sources(workspace: Workspace, name: str, reason: str) -> WorkspaceError:
 
 
 def transfer(
-    shell: Shell, ways: Sequence[WorkspacePlan], *, timeouts: Timeouts,
+    shell: Shell, ways: Sequence[WorkspacePlan], *, timeouts: Timeouts, owned: bool = True,
     cancel: Optional[threading.Event] = None,
     on_progress: Optional[Callable[[int, int], None]] = None,
     before_build: Callable[[], object] = lambda: None,
@@ -336,13 +349,14 @@ def transfer(
     Send workspaces to the same paths on a machine, and build them if necessary.
 
     :param ways: the workspaces, in the order in which they are sourced.
+    :param owned: see ``make_folder``.
     :param on_progress: callback with the bytes sent and the total bytes.
     :param before_build: returns when the tools for the build are installed.
     :returns: what was done, in a few words.
     """
     linked = dict.fromkeys(folder for way in ways for folder in way.linked)
     for target in sorted((*(way.target for way in ways), *map(str, linked))):
-        shell.run(make_folder(target), timeout=timeouts.command, cancel=cancel)
+        shell.run(make_folder(target, owned=owned), timeout=timeouts.command, cancel=cancel)
     sync = functools.partial(
         shell.sync, timeout=timeouts.sync, cancel=cancel, on_progress=on_progress)
     reports = [retried(functools.partial(
@@ -360,11 +374,16 @@ def transfer(
         f'built there: {way.reason}' for way in ways if way.commands)])
 
 
-def make_folder(target: str) -> Command:
-    """Return the command that makes a folder, as root where the login user may not."""
+def make_folder(target: str, *, owned: bool) -> Command:
+    """
+    Return the command that makes a folder, as root where the login user may not.
+
+    :param owned: whether the launch owns the machine; else it may have accounts of others.
+    """
     path = shlex.quote(target)
+    check = '' if owned else f'sh -c {shlex.quote(_OF_OTHERS)} sh {path} || exit\n'
     return Command.script(
-        f'[ -w {path} ] || mkdir -p {path} 2>/dev/null || '
+        f'{check}[ -w {path} ] || mkdir -p {path} 2>/dev/null || '
         f'sudo -n sh -ec {shlex.quote(_AS_ROOT)} sh {path} "$(id -u):$(id -g)"',
         what='make a folder for the workspace')
 

@@ -515,9 +515,43 @@ def test_folder_that_root_makes_opens_and_none_is_taken_over() -> None:
         write(folder / 'bin/sudo', '#!/bin/sh\nshift\nPATH=/usr/bin:/bin exec "$@"\n', 0o755)
         (folder / 'theirs').mkdir()
         results = [subprocess.run(
-            workspace.make_folder(f'{name}/{target}').argv, user=65534, group=65534, umask=0o027,
-            env={'PATH': f'{name}/bin:/usr/bin:/bin'}, capture_output=True, text=True)
+            workspace.make_folder(f'{name}/{target}', owned=True).argv,
+            user=65534, group=65534, umask=0o027, env={'PATH': f'{name}/bin:/usr/bin:/bin'},
+            capture_output=True, text=True)
             for target in ('new/workspace', 'theirs')]
         assert (folder / 'new').stat().st_mode & 0o777 == 0o755
     assert results[0].returncode == 0
     assert results[1].returncode == 1 and 'theirs belongs to root' in results[1].stderr
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root can act as another user')
+@pytest.mark.parametrize(('target', 'refused'), [
+    ('home/workspace', ''), ('home/new/workspace', ''), ('theirs/workspace', 'theirs'),
+    ('theirs/new/workspace', 'theirs'), ('home/link', 'home/link')])
+def test_folder_where_another_account_may_replace_it_is_refused(
+    target: str, refused: str,
+) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        for path, owner in ('home', 65533), ('theirs', 65534):
+            (folder / path).mkdir()
+            os.chown(folder / path, owner, owner)
+        (folder / 'home/link').symlink_to('.')
+        os.lchown(folder / 'home/link', 65534, 65534)
+        done = subprocess.run(
+            workspace.make_folder(f'{name}/{target}', owned=False).argv, user=65533, group=65533,
+            env={'PATH': '/usr/bin:/bin'}, capture_output=True, text=True)
+        assert refused or (folder / target).stat().st_uid == 65533
+    assert done.returncode == bool(refused)
+    assert (f'{folder}/{refused} belongs to another account' in done.stderr) == bool(refused)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root can give files away')
+def test_root_gives_away_nothing_that_a_link_leads_to(tmp_path: Path) -> None:
+    """Another account replaces the folder between two commands of root."""
+    write(tmp_path / 'bin/mkdir', f'#!/bin/sh\nln -s {tmp_path}/of_root "$2"\n', 0o755)
+    (tmp_path / 'of_root').touch()
+    subprocess.run(['sh', '-ec', workspace._AS_ROOT, 'sh', f'{tmp_path}/new', '65534:65534'],
+                   env={'PATH': f'{tmp_path}/bin:/usr/bin:/bin'}, check=True)
+    assert (tmp_path / 'of_root').stat().st_uid == 0

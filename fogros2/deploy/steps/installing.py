@@ -54,7 +54,7 @@ def send_workspaces(
     with job.step('workspace') as detail:
         note = workspace.transfer(
             job.shell, ros.workspaces, timeouts=context.timeouts,
-            cancel=job.cancel, before_build=installed,
+            owned=context.capabilities.owned, cancel=job.cancel, before_build=installed,
             on_progress=lambda done, total: context.report(
                 Progress(job.name, 'workspace', done, total)))
         detail += [note, *workspace.left_behind(context.environment, job.spec.workspaces)]
