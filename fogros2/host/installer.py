@@ -173,7 +173,10 @@ python3 -m pip --version || ls "$VIRTUAL_ENV"/../wheels/pip-*.whl ||
 ENTER = """\
 set -e
 mkdir -p {folder}
-exec 9<{folder}/..
+before=$(umask)
+umask 077  # another account that may read the file could lock it
+exec 9>>{folder}/../.lock
+umask "$before"
 flock 9
 mkdir -p {folder}
 cd {folder}

@@ -8,6 +8,7 @@ import fcntl
 import os
 from pathlib import Path
 import re
+import subprocess
 import sys
 from typing import Any
 
@@ -229,13 +230,21 @@ def test_second_launch_keeps_what_the_first_installed(tmp_path: Path, what: str)
         (command,) = plan(home).commands
     (folder / 'venv').mkdir(parents=True)
     (folder / 'site').mkdir()
-    first = os.open(folder.parent, os.O_RDONLY)
+    first = os.open(folder.parent / '.lock', os.O_RDWR | os.O_CREAT)
     fcntl.flock(first, fcntl.LOCK_EX)
     second = in_thread(lambda: process.run(command, timeout=60.0))
     (folder / 'complete').touch()
     os.close(first)
     second.result(60.0)
     assert {path.name for path in folder.iterdir()} == {'complete', 'site', 'venv'}
+
+
+def test_no_other_account_locks_an_installation(tmp_path: Path) -> None:
+    script = f"umask 022\n{installer.ENTER.format(folder=tmp_path / 'share/k1')}umask >seen\n"
+    subprocess.run(['sh', '-c', script], check=True)
+    assert (tmp_path / 'share/.lock').stat().st_mode & 0o777 == 0o600
+    # what it installs may be read as before
+    assert (tmp_path / 'share/k1/seen').read_text() == '0022\n'
 
 
 @pytest.mark.parametrize('facts', [
