@@ -163,6 +163,11 @@ def write(path: Path, text: str) -> None:
     aside.replace(path)
 
 
+def lock_file(path: Path) -> IO[str]:
+    """Open a file for locks of root's: a guest that could read it could lock it."""
+    return open(path, 'a', opener=lambda name, flags: os.open(name, flags, 0o600))
+
+
 def account(name: str, address: str) -> str:
     """Return the account of the guest at an address of an interface."""
     return f"{name}g{address.rpartition('.')[2]}"
@@ -184,7 +189,7 @@ class Guests:
     @contextlib.contextmanager
     def locked(self) -> Iterator[list[Guest]]:
         """Keep other processes from changing the list during the block; yield the list."""
-        with open(self.lock, 'a') as lock:
+        with lock_file(self.lock) as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             yield json.loads(self.state.read_text()) if self.state.exists() else []
 
@@ -463,7 +468,7 @@ class Door(socketserver.ThreadingTCPServer):
 def serve(guests: Guests, request: dict[str, Any]) -> None:
     """Be the door, unless there is one; at the end take down an interface that was left to it."""
     os.umask(0o022)
-    with open(guests.door, 'a') as own:
+    with lock_file(guests.door) as own:
         with guests.locked():
             try:
                 fcntl.flock(own, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -94,6 +94,17 @@ def test_list_is_private_and_replaces_no_file_of_others(tmp_path: Path) -> None:
     assert (tmp_path / 'other').read_text() == ''
 
 
+def test_no_guest_locks_the_list(tmp_path: Path) -> None:
+    found = guests.Guests('fogabc123m0', tmp_path)
+    before = os.umask(0o022)
+    try:
+        with found.locked(), guests.lock_file(found.door):
+            modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+    finally:
+        os.umask(before)
+    assert modes == {'fogabc123m0.more.lock': 0o600, 'fogabc123m0.more.door': 0o600}
+
+
 class Machine:
     """
     A machine with an interface whose guests have accounts, which are all it keeps.
