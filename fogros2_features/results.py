@@ -26,7 +26,7 @@ from fogros2.feature import Feature, RunningMachine
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.ros_names import check_name
 from fogros2.shell.command_line import remote_path
-from fogros2.shell.sync import size_on_disk
+from fogros2.shell.sync import size_on_disk, Stall
 from fogros2.store import check_owner
 
 if TYPE_CHECKING:
@@ -37,6 +37,8 @@ TARGET, LIMIT = '~/fogros2', 10e9
 #: Seconds in which no byte comes, and the number of attempts in which none comes, until a copy
 #: fails. rsync reads what came before, so 10 GB on a slow disk need minutes.
 TIMEOUT, ATTEMPTS = 900.0, 3
+#: Bytes per second that a machine has to send, so that it can't hold the launch's end for good.
+SLOWEST = 10e3
 #: Bytes that a folder may take on the disk beyond its limit: each small file has a block.
 SLACK = 100e6
 #: Where a machine, by its name, keeps recordings until they come home, and the name of the folder.
@@ -149,7 +151,8 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
     for folder, target in _targets(home, sizes).items():
         try:
             # a folder may grow meanwhile, and many small files take more than their sizes
-            _copy(running, folder, target, int(max(2 * sizes[folder], own.limit) + SLACK))
+            _copy(running, folder, target, size=sizes[folder],
+                  limit=int(max(2 * sizes[folder], own.limit) + SLACK))
         except FogError as error:
             failures.append(error)
             if isinstance(error, ConnectError):
@@ -175,15 +178,17 @@ def _make(folder: Path, *, number: int = 0) -> Path:
     return path
 
 
-def _copy(running: RunningMachine, folder: str, target: Path, limit: int) -> None:
+def _copy(running: RunningMachine, folder: str, target: Path, *, size: int, limit: int) -> None:
     _make(target)
-    arrived, failures = 0, 0
+    arrived, failures, late = 0, 0, Stall(None, TIMEOUT + size / SLOWEST)
     while True:
         try:
-            running.shell.fetch(folder, target, known=None, limit=limit, timeout=TIMEOUT)
+            running.shell.fetch(
+                folder, target, known=None, limit=limit, timeout=TIMEOUT, cancel=late)
             return
         except (ConnectError, DeadlineExceeded):
-            before, arrived = arrived, size_on_disk(target)
+            # a machine may take back what it has sent
+            before, arrived = arrived, max(arrived, size_on_disk(target))
             failures = 1 if arrived > before else failures + 1
             if failures == ATTEMPTS:
                 raise  # what has arrived stays

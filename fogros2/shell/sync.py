@@ -162,7 +162,7 @@ class Stall(threading.Event):
         :raises DeadlineExceeded: the copy makes no progress.
         """
         if time.monotonic() - self._since > self._timeout:
-            raise DeadlineExceeded(f'rsync has copied nothing for {self._timeout:g} s',
+            raise DeadlineExceeded(f'rsync has copied too little in {self._timeout:g} s',
                                    "check the robot's network")
         return self._cancel is not None and self._cancel.is_set()
 

@@ -348,6 +348,45 @@ def test_link_that_drops_often_brings_all_home(
     assert len(brought(running, fetch=['~/bags'])) == 2 * results.ATTEMPTS + 1
 
 
+def test_machine_that_takes_back_what_it_sent_holds_no_end(
+    home: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (home / 'bags').mkdir()
+    running, sent = FakeRunning(), [True, False] * 20
+
+    def withdrawn(source: str, target: Path, **more: Any) -> None:
+        if sent.pop():
+            (target / 'x').unlink(missing_ok=True)
+        else:
+            (target / 'x').touch()
+        raise ConnectError('it was lost')
+
+    monkeypatch.setattr(running.shell, 'fetch', withdrawn)
+    with pytest.raises(ConnectError):
+        brought(running, fetch=['~/bags'])
+
+
+def test_copy_ends_at_a_time_that_follows_from_its_size(
+    home: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A hijacked machine sends a little now and then."""
+    (home / 'bags').mkdir()
+    running = FakeRunning()
+
+    def slow(source: str, *words: Any, cancel: Any, **more: Any) -> None:
+        assert not cancel.is_set()
+        begin = time.monotonic()
+        later = begin + results.TIMEOUT + 1e9 / results.SLOWEST
+        monkeypatch.setattr(time, 'monotonic', lambda: later - 1.0)
+        assert not cancel.is_set()
+        monkeypatch.setattr(time, 'monotonic', lambda: later + 1.0)
+        cancel.is_set()
+
+    monkeypatch.setattr(running.shell, 'fetch', slow)
+    with pytest.raises(DeadlineExceeded, match='too little'):
+        results._copy(running, '~/bags', home / 'target', size=int(1e9), limit=1)
+
+
 def test_folder_on_the_robot_is_checked_before(home: Path) -> None:
     (home / 'file').touch()
     own = Results.options(fetch=['~/bags'], fetch_to=str(home / 'file/deep'))
