@@ -15,6 +15,8 @@ import dataclasses
 import re
 from typing import Any, Optional
 
+import numpy as np
+
 #: The part of a bandwidth that is divided; the rest is for the headers of DDS, UDP and the VPN,
 #: for acknowledgements and camera info.
 PAYLOAD = 0.8
@@ -26,10 +28,12 @@ MOST, UNLIMITED = 1e12, 1e9
 #: it needs ROOM times what it uses; the need stays while it is between STEADY times the use.
 LIMITED, ROOM, STEADY = 0.6, 2.0, (1.4, 3.0)
 #: Maximum number of streams of a link, and of links of a stream.
-MOST_STREAMS, MOST_LINKS = 1024, 16
+MOST_STREAMS, MOST_LINKS = 256, 16
+#: Maximum characters of a stream's name; a topic's name has fewer.
+_NAME = 255
 #: Names of links. A machine chooses among them: an encoder publishes nowhere else, such as on the
 #: topic of a controller that takes the same type.
-_LINK = re.compile(r'/fogros2/\w+/link_(in|out)', re.ASCII)
+_LINK = re.compile(r'/fogros2/[A-Za-z]\w{0,63}/link_(in|out)', re.ASCII)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,25 +64,24 @@ def divide(bandwidth: float, claims: Mapping[str, Claim]) -> dict[str, float]:
     All get their floor, then up to their need, then up to their ceiling. Where the bandwidth ends,
     those with the least for their priority come first (weighted max-min fairness).
     """
-    low = dict.fromkeys(claims, 0.0)
-    for count in (1, 2, 3):
-        high = {name: max((one.floor, one.need, one.ceiling)[:count])
-                for name, one in claims.items()}
-        if sum(high.values()) > bandwidth:
+    priorities = np.array([one.priority for one in claims.values()])
+    low = np.zeros(len(claims))
+    for high in np.maximum.accumulate(np.array([
+            [getattr(one, what) for one in claims.values()]
+            for what in ('floor', 'need', 'ceiling')])):
+        if high.sum() > bandwidth:
             break
         low = high
     else:
-        return low
-
-    def at(level: float) -> dict[str, float]:
-        return {name: min(max(level * one.priority, low[name]), high[name])
-                for name, one in claims.items()}
-
-    below, above = 0.0, max(high[name] / one.priority for name, one in claims.items())
+        return dict(zip(claims, low.tolist()))
+    below, above = 0.0, float((high / priorities).max())
     for _ in range(60):
         level = (below + above) / 2
-        below, above = (below, level) if sum(at(level).values()) > bandwidth else (level, above)
-    return at(below)
+        if np.clip(level * priorities, low, high).sum() > bandwidth:
+            above = level
+        else:
+            below = level
+    return dict(zip(claims, np.clip(below * priorities, low, high).tolist()))
 
 
 def needed(used: float, share: float, before: float, ceiling: float, *, short: bool) -> float:
@@ -131,6 +134,7 @@ class Link:
 def claim_of(message: Any) -> Optional[tuple[str, Claim]]:
     """Return the stream and the claim of a ``Float64MultiArray``, None if it is invalid."""
     if (len(message.layout.dim) != 1 or len(message.data) != 6
+            or len(message.layout.dim[0].label) > _NAME
             or not all(0 <= value <= MOST for value in message.data)
             or not 0.01 <= message.data[0] <= 100.0):
         return None

@@ -17,10 +17,11 @@ import pytest
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 pytest.importorskip('zstandard', reason='the extra "point-clouds" is not installed')
 from fogros2_replicas.pairs import header_of, Pair
-from image_transport_h264.budget import Budget
+from image_transport_h264.budget import Budget, REPORT
 from image_transport_h264.codec import Settings
 from image_transport_h264.control import Control
 from image_transport_h264.lazy import LazyNode, MOST_CAUSES
+from image_transport_h264.sharing import Claim, Link, LISTEN, MOST_LINKS
 from point_cloud_stream.cloud import CloudError, Field, Layout
 
 #: Bytes that the names of a hijacked machine may take.
@@ -60,6 +61,24 @@ def test_acknowledgements_of_many_names_take_little() -> None:
     assert control.protects(4.0)
 
 
+def test_claims_on_links_take_little() -> None:
+    links = [Link(10e6, -LISTEN) for _ in range(MOST_LINKS)]
+
+    def flood() -> None:
+        for link in links:
+            for number in range(600):
+                label = f'{number}'.ljust(60_000 if number < 300 else 255)
+                link.heard(SimpleNamespace(
+                    layout=SimpleNamespace(dim=[SimpleNamespace(label=label)]),
+                    data=[0.01 + number % 100, 0.0, 1e3 * (number + 1), 1e9, 0.0, 0.0]), 0.0)
+
+    assert taken(flood) < LIMIT
+    begin = time.process_time()
+    for link in links:
+        link.share('/own/h264', Claim(1.0, 2e5, 1e6, 1e9, 0.0), 0.1)
+    assert time.process_time() - begin < REPORT / 5
+
+
 def test_frame_ids_of_one_stamp_take_little() -> None:
     pair = Pair(['a', 'b'])
     pair.input(0.0, (1, ''))
@@ -80,7 +99,10 @@ def test_frame_ids_of_one_stamp_take_little() -> None:
     ('/fogros2/planner_1/link_in', True), ('/fogros2/m/link_out', True),
     ('/forward_velocity_controller/commands', False), ('/fogros2/m/cmd', False),
     ('/fogros2/m/link_in/x', False), ('/fogros2/a/b/link_in', False), ('link_in', False),
-    ('/x/fogros2/m/link_in', False), ('/fogros2//link_in', False)])
+    ('/x/fogros2/m/link_in', False), ('/fogros2//link_in', False),
+    # rclpy raises an error for them, which would end the encoder
+    ('/fogros2/0/link_in', False), (f'/fogros2/{300 * "m"}/link_in', False)],
+    ids=lambda value: str(value)[:40])
 def test_encoder_publishes_claims_on_links_alone(name: str, link: bool) -> None:
     """Controllers take the type of a claim, and a decoder announces the topics."""
     node = mock.Mock()

@@ -148,7 +148,7 @@ def test_hostile_reports_are_bounded() -> None:
     ([], [1, 1, 1, 1, 1, 1]), (['/a', '/b'], [1, 1, 1, 1, 1, 1]), (['/a'], [1, 1, 1, 1, 1]),
     (['/a'], [0, 1, 1, 1, 1, 1]), (['/a'], [1e3, 1, 1, 1, 1, 1]), (['/a'], [1, -1, 1, 1, 1, 1]),
     (['/a'], [1, 1, math.nan, 1, 1, 1]), (['/a'], [1, 1, 1, math.inf, 1, 1]),
-    (['/a'], [1, 1, 1, 1, 1, 1e300])])
+    (['/a'], [1, 1, 1, 1, 1, 1e300]), (['/' + 255 * 'a'], [1, 1, 1, 1, 1, 1])])
 def test_invalid_report_is_no_claim(labels: list[str], data: list[float]) -> None:
     assert claim_of(message(labels, data)) is None
 
