@@ -506,7 +506,7 @@ def _inspect_installed(
             if entry.is_symlink():
                 with contextlib.suppress(FileNotFoundError):  # deleted meanwhile
                     reached.append(_target(entry.path))
-            elif entry.name.endswith(('.egg-link', '.pth')):
+            elif entry.name.endswith(('.egg-link', '.pth')) and entry.is_file():
                 with contextlib.suppress(FileNotFoundError):
                     reached.extend(written_paths(Path(entry.path)))
             elif '/lib/' in entry.path or '/bin/' in entry.path or _LIBRARY.search(entry.name):
@@ -543,14 +543,16 @@ def _ways_out(root: Path) -> Callable[[Path], Optional[Path]]:
     top = os.path.realpath(root)
 
     @functools.cache
+    def leads_out(path: Path) -> bool:
+        return path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(top)
+
     def way_out(path: Path) -> Optional[Path]:
-        if path == root:
-            return None
-        way = way_out(path.parent)
-        if way is None and path.is_symlink() \
-                and not Path(os.path.realpath(path)).is_relative_to(top):
-            return path
-        return way
+        way = root
+        for part in path.relative_to(root).parts:
+            way /= part
+            if leads_out(way):
+                return way
+        return None
 
     return way_out
 

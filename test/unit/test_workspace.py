@@ -20,7 +20,7 @@ from fogros2.host.inspection import HostFacts, Python
 from fogros2.model import Command, Endpoint, MachineSpec, Result, SyncReport
 from fogros2.report import silent
 from fogros2.shell.local import LocalShell
-from fogros2.waiting import Timeouts
+from fogros2.waiting import in_thread, Timeouts
 from fogros2_testing.fakes import FakeProvider, FakeShell
 
 PYTHON = Python('/usr/bin/python3', (3, 12), True)
@@ -445,6 +445,17 @@ def test_a_workspace_is_sourced_unless_it_is_already(root: Path) -> None:
     assert after['AMENT_PREFIX_PATH'] == f'{root}/install/alpha:/opt/ros/jazzy'
     assert workspace.sourced(str(root), after) is after
     assert workspace.sourced(None, before) is before
+
+
+def test_link_into_deep_folders_is_followed(root: Path) -> None:
+    deep = write(root.joinpath('build', *500 * 'd', 'file'))
+    (root / 'install/alpha/lib/alpha/file').symlink_to(deep)
+    assert workspace.inspect(root).links == (deep,)
+
+
+def test_pipe_of_a_workspace_is_not_read(root: Path) -> None:
+    os.mkfifo(root / 'install/alpha/lib/alpha.pth')
+    assert in_thread(lambda: workspace.inspect(root)).result(10.0).links == ()
 
 
 def test_links_into_ros_itself_may_stay(root: Path) -> None:
