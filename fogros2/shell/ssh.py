@@ -9,10 +9,10 @@ import threading
 import time
 from typing import Optional, TYPE_CHECKING
 
-from fogros2.errors import ConnectError, FogError, ShellError
+from fogros2.errors import ConnectError, DeadlineExceeded, FogError, ShellError
 from fogros2.model import Command
 from fogros2.shell import command_line, flow, ssh_connection
-from fogros2.shell.lines import Channel, Output, take_errors
+from fogros2.shell.lines import Channel, close, Output, take_errors
 from fogros2.shell.remote import RemoteShell
 from fogros2.untrusted import clean
 from fogros2.waiting import wait_until
@@ -87,6 +87,7 @@ class SSHShell(RemoteShell['paramiko.Transport']):
 
         try:
             channel = self._session(connection, timeout, cancel)
+            vars(channel)['_wait_for_event'] = functools.partial(self._answered, channel, timeout)
             if size is not None:
                 rows, columns, kind = size
                 channel.get_pty(kind, columns, rows)
@@ -105,6 +106,17 @@ class SSHShell(RemoteShell['paramiko.Transport']):
             if isinstance(error, (EOFError, OSError)) or not connection.is_alive():
                 self._drop(connection)
             raise ConnectError(f"'{self.name}' can not start a command: {error}") from error
+
+    def _answered(self, channel: paramiko.Channel, timeout: float) -> None:
+        """
+        Wait until the server has answered a request; paramiko would wait for good.
+
+        :raises DeadlineExceeded: it has not answered.
+        """
+        if not channel.event.wait(timeout):
+            close(channel)
+            raise DeadlineExceeded(f"'{self.name}' has not begun a command within {timeout:g} s")
+        type(channel)._wait_for_event(channel)  # type: ignore[attr-defined]
 
     def _first(self, channel: paramiko.Channel, before: bytearray, size: int) -> bytes:
         """

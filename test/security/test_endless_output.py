@@ -18,6 +18,7 @@ from fogros2.model import Command, Endpoint
 from fogros2.shell import multiplexed
 from fogros2.shell import multiplexer as mux
 from fogros2.shell.remote import MultiplexedShell
+from fogros2.shell.ssh import SSHShell
 from fogros2.waiting import in_thread
 from rigs.memory import measure
 
@@ -218,3 +219,29 @@ def test_machine_that_takes_no_input_holds_no_command(
     begun = in_thread(lambda: shell.run(Command(('cat',), input=bytes(200)), timeout=0.1))
     with pytest.raises(DeadlineExceeded, match="cat took too long on 'planner'"):
         begun.result(5.0)
+
+
+def test_ssh_server_that_never_answers_holds_no_command(tmp_path: Path) -> None:
+    key = paramiko.ECDSAKey.generate()
+    key.write_private_key_file(str(tmp_path / 'key'))
+    over = threading.Event()
+
+    class Silent(Server):
+        def check_channel_exec_request(self, channel: paramiko.Channel, command: bytes) -> bool:
+            return over.wait(60)
+
+    def answer(link: socket.socket) -> None:
+        transport = paramiko.Transport(link)
+        transport.add_server_key(key)
+        transport.start_server(server=Silent())
+        over.wait(60)
+        transport.close()
+
+    with serving(answer) as port:
+        shell = SSHShell(Endpoint(
+            'ssh', '127.0.0.1', port, 'fog', f'{key.get_name()} {key.get_base64()}',
+            str(tmp_path / 'key')), name='planner')
+        with pytest.raises(DeadlineExceeded, match="'planner' has not begun a command within 1 s"):
+            in_thread(lambda: shell.run(Command(('true',)), timeout=1.0)).result(10.0)
+        over.set()
+        shell.close()
