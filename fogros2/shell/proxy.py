@@ -4,21 +4,47 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 import socket
 import subprocess
-from typing import Optional
+import time
+from typing import Any, Optional
 
 from fogros2 import process
 from fogros2.errors import ConnectError
 from fogros2.model import Command
+
+#: Seconds in which a program takes nothing until the connection counts as lost.
+STUCK = 60.0
 
 
 class ProxySocket(socket.socket):
     """Our end of the streams of a program, which ends with it."""
 
     child: subprocess.Popen[bytes]
+    _stuck_since: Optional[float] = None
+
+    def send(self, data: Any, flags: int = 0) -> int:
+        """
+        Send what the program takes within the time-out.
+
+        :raises TimeoutError: it takes nothing.
+        :raises ConnectionAbortedError: it has taken nothing for ``STUCK`` seconds; a TCP
+            connection would end, too.
+        """
+        now = time.monotonic()
+        try:
+            sent = super().send(data, flags)
+        except TimeoutError:
+            self._stuck_since = self._stuck_since or now
+            if now - self._stuck_since > STUCK:
+                raise ConnectionAbortedError(
+                    errno.ECONNABORTED, 'the proxy takes nothing') from None
+            raise
+        self._stuck_since = None
+        return sent
 
     def close(self) -> None:
         """End the program; a read in another thread returns b''."""

@@ -15,7 +15,7 @@ import pytest
 
 from fogros2.errors import ConnectError, DeadlineExceeded
 from fogros2.model import Command, Endpoint
-from fogros2.shell import multiplexed
+from fogros2.shell import multiplexed, proxy
 from fogros2.shell import multiplexer as mux
 from fogros2.shell.remote import MultiplexedShell
 from fogros2.shell.ssh import SSHShell
@@ -245,3 +245,16 @@ def test_ssh_server_that_never_answers_holds_no_command(tmp_path: Path) -> None:
             in_thread(lambda: shell.run(Command(('true',)), timeout=1.0)).result(10.0)
         over.set()
         shell.close()
+
+
+def test_proxy_that_takes_nothing_ends_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hijacked machine reads nothing; paramiko repeats a write that timed out for good."""
+    monkeypatch.setattr(proxy, 'STUCK', 0.1)
+    with contextlib.closing(proxy.dial(Command(('sleep', '60')), 0.02)) as link:
+        def fill() -> None:
+            while True:
+                with contextlib.suppress(TimeoutError):
+                    link.send(bytes(1 << 16))
+
+        with pytest.raises(ConnectionAbortedError, match='takes nothing'):
+            in_thread(fill).result(10.0)
