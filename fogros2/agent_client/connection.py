@@ -79,6 +79,8 @@ class AgentClient:
         #: Lines to write, each with its connection; None ends the writing thread.
         self._lines: queue.SimpleQueue[Optional[tuple[Stream, bytes]]] = queue.SimpleQueue()
         self._heard = 0.0
+        #: Seconds in which the link took pieces of long requests.
+        self._sending = 0.0
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
         self._stream: Optional[Stream] = None
@@ -132,8 +134,8 @@ class AgentClient:
         If the connection breaks, the client reconnects and repeats the request, except ``signal``,
         which would take effect twice.
 
-        :param timeout: seconds, including the time of lost connections. A long request gets
-            ``SILENCE / 4`` more for each ``PIECE``.
+        :param timeout: seconds, including the time of lost connections, but not the time in which
+            the link takes long requests, of which each ``PIECE`` has ``SILENCE / 4``.
         :param silent: seconds without any data after which the request fails earlier; must be more
             than half of ``SILENCE``, because a busy agent still answers pings. An absent agent
             then gets ``PATIENCE`` seconds instead of ``RESTART``.
@@ -153,15 +155,14 @@ class AgentClient:
             stream = self._stream
         if stream is not None:
             self._lines.put((stream, line))
-        begin = time.monotonic()
-        deadline = begin + timeout + len(line) // PIECE * SILENCE / 4
+        begin = self._clock()
+        deadline = begin + timeout
         try:
-            while not pending.done.wait(min(0.1, max(0.0, deadline - time.monotonic()))):
-                if time.monotonic() >= deadline:
+            while not pending.done.wait(min(0.1, max(0.0, deadline - self._clock()))):
+                if self._clock() >= deadline:
                     raise DeadlineExceeded(
                         f"the agent didn't answer '{command}' within {timeout:g} s")
-                if silent is not None and min(
-                        self.silent_for, time.monotonic() - begin) > silent:
+                if silent is not None and min(self.silent_for, self._clock() - begin) > silent:
                     raise DeadlineExceeded(
                         f"the agent sent nothing for {silent:g} s and didn't answer '{command}'")
                 absent_since = self._absent_since
@@ -347,6 +348,11 @@ class AgentClient:
                     # a single piece may wait in the buffers of a dead connection
                     if position > 0 and now - begin < SILENCE / 4:
                         self._heard = now
+                        self._sending += now - begin
+
+    def _clock(self) -> float:
+        """Return a monotonic time in seconds that stands still while the link takes pieces."""
+        return time.monotonic() - self._sending
 
     def _watch(self) -> None:
         """Ping a silent connection, and close it if nothing comes back."""
