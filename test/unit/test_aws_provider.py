@@ -466,7 +466,8 @@ def booted(tmp_path):
     """Run what an instance runs at boot, in a folder instead of the root; ends what it starts."""
     def run(told, **variables):
         script = told['bootcmd'][0][2]
-        for path in ('/opt/fogros2', '/run/fogros2', '/var/log', '/root/.ssh'):
+        for path in ('/opt/fogros2', '/run/fogros2', '/var/log', '/root/.ssh',
+                     '/etc/needrestart'):
             (tmp_path / path.lstrip('/')).parent.mkdir(parents=True, exist_ok=True)
             script = script.replace(path, f'{tmp_path}{path}')
         (tmp_path / 'var/log').mkdir(exist_ok=True)
@@ -544,6 +545,12 @@ def test_other_version_of_the_agent_is_replaced(booted):
     assert program.read_text() == agent_program()
     wait_until(lambda: process() not in (False, '', older), timeout=60.0,
                what='the other agent')
+
+
+def test_updates_of_the_system_do_not_restart_the_agent(booted):
+    top = booted(config(machine='planner', directory='/run/fogros2'))
+    settings = top / 'etc/needrestart/conf.d/fogros2.conf'
+    assert settings.read_text() == '$nrconf{override_rc}{qr(^fogros2-agent)} = 0;\n'
 
 
 def test_keys_that_an_image_brings_along_are_taken_away_once(booted, tmp_path):
