@@ -20,6 +20,7 @@ from fogros2.errors import (
     ConnectError,
     DeadlineExceeded,
     FogError,
+    HostKeyError,
 )
 from fogros2.model import Command, to_json
 from fogros2.shell import Shell, Stream
@@ -32,6 +33,9 @@ SILENCE = 20.0
 RESTART = 35.0
 #: Seconds after which nobody waits for it on the way down, or for a program without an answer.
 PATIENCE = 5.0
+#: Seconds for which each attempt to reconnect may fail for another reason than the network: a
+#: refused login, or too little memory on this computer.
+REFUSAL = 300.0
 
 #: Bytes of a long request that are written at once.
 PIECE = 1 << 14
@@ -365,10 +369,20 @@ class AgentClient:
             self._lines.put((stream, _PING))
 
     def _reopen(self) -> None:
-        """Reconnect, with increasing pauses, until the client is closed."""
+        """Reconnect, with increasing pauses, until the client is closed, or refused for long."""
+        refused_since = math.inf
+
         def attempt() -> Optional[Stream]:
-            with contextlib.suppress(ConnectError, DeadlineExceeded):
+            nonlocal refused_since
+            try:
                 return self._shell.open(self._command)
+            except (ConnectError, DeadlineExceeded):
+                refused_since = math.inf
+            except FogError as error:
+                now = time.monotonic()
+                refused_since = min(refused_since, now)
+                if isinstance(error, HostKeyError) or now - refused_since > REFUSAL:
+                    raise
             return None
 
         try:
@@ -378,7 +392,6 @@ class AgentClient:
         except Cancelled:
             return
         except FogError as error:
-            # a changed host key or a refused login key: reconnecting does not help
             self._error = AgentError(f"the agent can't be reached: {error.args[0]}", error.hint)
             return
         if self._closed.is_set():

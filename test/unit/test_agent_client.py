@@ -19,8 +19,12 @@ from fogros2.errors import (
     AgentAbsent,
     AgentError,
     AuthenticationError,
+    ConfigurationError,
     ConnectError,
     DeadlineExceeded,
+    HostKeyError,
+    PrerequisiteError,
+    ShellError,
 )
 from fogros2.waiting import in_thread, wait_until
 from rigs import recorded_agent
@@ -50,11 +54,12 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., AgentClient]
 
     def build(
         *streams: Any, silence: float = connection.SILENCE, restart: float = connection.RESTART,
-        patience: float = connection.PATIENCE,
+        patience: float = connection.PATIENCE, refusal: float = connection.REFUSAL,
     ) -> AgentClient:
         monkeypatch.setattr(connection, 'SILENCE', silence)
         monkeypatch.setattr(connection, 'RESTART', restart)
         monkeypatch.setattr(connection, 'PATIENCE', patience)
+        monkeypatch.setattr(connection, 'REFUSAL', refusal)
         shell: Any = ScriptedShell(*streams)
         clients.append(AgentClient(shell, '/run/x', agent_path='/run/x/agent.py'))
         return clients[-1]
@@ -243,15 +248,36 @@ def test_program_that_ends_without_output_is_given_up(make):
     assert len(client._shell.opened) < 6
 
 
-def test_machine_that_refuses_the_key_is_given_up(make):
+def given_up(client: AgentClient, first: ScriptedStream) -> list[str]:
+    """Lose the connection; return its states until the agent is given up."""
+    seen = followed(client)
+    first.say(None)
+    until(lambda: seen and seen[-1]['state'] == 'absent')
+    return [event['state'] for event in seen]
+
+
+def test_machine_that_keeps_refusing_the_key_is_given_up(make):
     first = agent()
-    client = make(first, AuthenticationError('key refused'), agent())
+    client = make(first, *(AuthenticationError('key refused') for _ in range(50)), refusal=0.3)
+    assert given_up(client, first) == ['lost', 'absent']
+    with pytest.raises(AgentError, match='key refused'):
+        client.request('status')
+
+
+def test_machine_with_another_host_key_is_given_up_at_once(make):
+    first = agent()
+    assert given_up(make(first, HostKeyError('changed'), agent()), first) == ['lost', 'absent']
+
+
+@pytest.mark.parametrize('kind', [
+    AuthenticationError, ConfigurationError, PrerequisiteError, ShellError])
+def test_error_of_one_attempt_to_reconnect_is_passing(make, kind):
+    first = agent()
+    client = make(first, kind('for a moment'), agent())
     seen = followed(client)
     first.say(None)
     until(lambda: len(seen) == 2)
-    assert [e['state'] for e in seen] == ['lost', 'absent']
-    with pytest.raises(AgentError, match='key refused'):
-        client.request('status')
+    assert [event['state'] for event in seen] == ['lost', 'back']
 
 
 def test_close_ends_the_thread_and_waiting_requests(make):
