@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 GRACE = 10.0
 #: Seconds of a notice for the last copy of a checkpoint.
 CHECKPOINT = 20.0
-#: Seconds until the provider is asked again.
-RETRY = 10.0
 
 
 class Moving(Nodes, Protocol):
@@ -111,7 +109,7 @@ class Replacer:
         def end() -> None:
             if not self._is_over():
                 self._end()
-        self._loop.call_later(RETRY, end)
+        self._loop.call_later(self.state.pause, end)
 
     def _create(self) -> None:
         async def create() -> None:

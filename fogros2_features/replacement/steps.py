@@ -22,6 +22,9 @@ Event = Literal['notice', 'lost', 'drained', 'ended', 'unended', 'created', 'ref
 #: the nodes move to it. ``retry``: ``end`` again after a pause. ``give_up``: create no more.
 Command = Literal['drain', 'end', 'move', 'create', 'come_back', 'retry', 'give_up']
 
+#: Seconds until the provider is asked again, at first.
+RETRY = 10.0
+
 
 @dataclasses.dataclass(frozen=True)
 class Replacement:
@@ -33,6 +36,7 @@ class Replacement:
     :param fence: seconds from the last heartbeat until the nodes of any machine have ended.
     :param moved: whether the nodes may run elsewhere.
     :param deadline: time of the next ``time`` event.
+    :param refused: number of creations that failed since the last one that did not.
     """
 
     limit: int
@@ -42,6 +46,12 @@ class Replacement:
     moved: bool = False
     deadline: Optional[float] = None
     created: int = 0
+    refused: int = 0
+
+    @property
+    def pause(self) -> float:
+        """Seconds until the provider is asked again; it may lack capacity for minutes."""
+        return RETRY * (1 if self.created >= self.limit else min(6 ** self.refused, 60))
 
 
 def decide(
@@ -72,7 +82,7 @@ def decide(
             return change(state, phase='over'), (*move, 'give_up')
         return change(state, phase='creating', created=state.created + 1), (*move, 'create')
     if phase == 'creating' and event == 'refused':
-        return change(state, phase='ending'), ('retry',)
+        return change(state, phase='ending', refused=state.refused + 1), ('retry',)
     if phase == 'creating' and event == 'created':
-        return change(state, phase='up', moved=False), ('come_back',)
+        return change(state, phase='up', moved=False, refused=0), ('come_back',)
     return state, ()

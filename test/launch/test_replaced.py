@@ -21,7 +21,7 @@ from fogros2.runtime.remote_process import process_on, remote_of
 from fogros2.shell.local import LocalShell
 from fogros2.store import Store
 from fogros2.waiting import wait_until
-from fogros2_features.replacement import Replacement, replacer, session, snapshots
+from fogros2_features.replacement import Replacement, session, snapshots, steps
 from rigs.launching import end, says
 
 THERE = '/there/program'
@@ -71,7 +71,7 @@ def test_node_that_the_robot_lacks_waits_for_the_machine(run, fake, planner, wat
 
 def test_lost_machine_is_deleted_before_nodes_start_here(
         run, fake, package, planner, talker, watch, monkeypatch):
-    monkeypatch.setattr(replacer, 'RETRY', 0.1)
+    monkeypatch.setattr(steps, 'RETRY', 0.01)
     fake.retire_errors += [ConnectError('no network'), ConnectError('no network')]
     lost, free = held(fake, says(fake, 'lost', reason='no answer'))
 
@@ -87,7 +87,7 @@ def test_lost_machine_is_deleted_before_nodes_start_here(
 
 def test_creations_that_fail_end_a_launch_whose_nodes_wait(
         run, fake, planner, watch, monkeypatch, capfd):
-    monkeypatch.setattr(replacer, 'RETRY', 0.1)
+    monkeypatch.setattr(steps, 'RETRY', 0.01)
     planner._options['image'] = 'mine'
     node = CloudNode(machine=planner, package='absent', executable='says')
 

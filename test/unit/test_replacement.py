@@ -59,6 +59,16 @@ def test_refused_creation_is_tried_again_up_to_the_limit():
     assert state.phase == 'over'
 
 
+def test_pauses_after_refused_creations_grow():
+    state, pauses = dataclasses.replace(UP, limit=5, phase='ending'), []
+    for _ in range(5):
+        _, state = play('ended', 'refused', state=state)
+        pauses.append(state.pause)
+    # it gives up without another pause
+    assert pauses == [60.0, 360.0, 600.0, 600.0, 10.0]
+    assert play('ended', 'created', state=dataclasses.replace(state, limit=9))[1].pause == 10.0
+
+
 def test_third_loss_gives_up_after_two_replacements():
     once = ('lost', 'ended', 'created')
     said, _ = play(*once, *once, 'notice', 'drained', 'ended')
