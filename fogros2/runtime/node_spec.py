@@ -8,6 +8,7 @@ import contextlib
 import os
 from pathlib import Path
 import re
+import tempfile
 from typing import Optional
 
 from launch import LaunchContext, Substitution
@@ -73,8 +74,15 @@ def use_names_of_programs(action: ExecuteLocal) -> None:
 
 
 @contextlib.contextmanager
-def packages_of(folder: Optional[str]) -> Iterator[None]:
-    """Let substitutions find the packages of a workspace during the block, sourced or not."""
+def packages_of(folder: Optional[str], files: Optional[Path]) -> Iterator[None]:
+    """
+    Let substitutions find the packages of a workspace during the block, sourced or not.
+
+    :param files: folder of temporary files, such as parameters; /tmp is cleaned after some days.
+    """
+    temporary = tempfile.tempdir
+    if files is not None:
+        tempfile.tempdir = str(files)
     before = os.environ.get('AMENT_PREFIX_PATH')
     known = before.split(os.pathsep) if before else []
     more = [prefix for prefix in workspace.prefixes(folder) if prefix not in known]
@@ -83,6 +91,7 @@ def packages_of(folder: Optional[str]) -> Iterator[None]:
     try:
         yield
     finally:
+        tempfile.tempdir = temporary
         if more and before is None:
             del os.environ['AMENT_PREFIX_PATH']
         elif more and before is not None:

@@ -113,13 +113,14 @@ class RemoteProcess:
         if context.is_shutdown:
             return None
         coordinator = Coordinator.of(context)
-        folder = None
+        folder = files = None
         if not coordinator.on_robot(self.machine):
             # before the action executes: launch_ros's actions do much before they prepare
             coordinator.engage([self.planned])
             # some of them create a ROS node here, which needs the launch's DDS settings
             folder = coordinator.session(self.machine).spec.workspace
-        with node_spec.packages_of(folder):
+            files = coordinator.folder
+        with node_spec.packages_of(folder, files):
             entities = self._own.execute(context) or []
         if self.session is None:
             return [*entities, *coordinator.beside(self.own, None, process_on)]

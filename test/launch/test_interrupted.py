@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from decimal import Decimal
 import functools
+from pathlib import Path
 import re
 import stat
 import threading
@@ -76,7 +77,9 @@ def test_nodes_continue_on_the_robot(run, fake, package, planner, talker, watch,
     assert len([name for name, _ in watch.exits if name == 'says']) == 1
     here = ''.join(watch.said)
     assert '-r __node:=mapper -r __ns:=/arm' in here and '-r in:=out' in here
-    assert '--params-file' in here
+    # /tmp is cleaned while a launch runs
+    (file,) = re.findall(r'--params-file (\S+)', here)
+    assert fake.store.launch_folder(fake.id) in Path(file).parents
     assert watch.interrupted == [('planner', REASON, False)]
     said = capfd.readouterr().out
     assert (f"the machine 'planner' is being reclaimed: {REASON}; "
