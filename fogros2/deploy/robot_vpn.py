@@ -15,7 +15,7 @@ from fogros2 import plan, process
 from fogros2.deploy.robot import run
 from fogros2.errors import Cancelled, CommandError, FogError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.report import Reporter, step, StepFailed
+from fogros2.report import Event, Reporter, step, StepFailed
 from fogros2.vpn import addresses, helped, owner, Vpn
 from fogros2.waiting import Periodic
 
@@ -78,6 +78,8 @@ class RobotVpn:
         self._peer: Optional[Peer] = None
         self._stop = threading.Event()
         self._poll_interval = POLL_INTERVAL
+        #: Why the last health check or repair failed, '' if it did not.
+        self._failure = ''
         # the helper needs no ticket; container machines then refresh one that is there
         self._ticket = not helped.made(interface) or process.sudo_trouble() is None
         self._ticket_valid = True
@@ -215,7 +217,7 @@ class RobotVpn:
         """
         Restart the interface's program if it has ended; nodes do not notice.
 
-        Return the seconds until the next check: a lasting failure is reported now and then.
+        Return the seconds until the next check; a lasting failure is reported once.
         """
         if self._ticket and time.monotonic() - self._ticket_refreshed > TICKET_REFRESH:
             self._ticket_refreshed = time.monotonic()
@@ -224,15 +226,21 @@ class RobotVpn:
             if self._stop.is_set() or self._ending.is_set():
                 return self._poll_interval  # the networks that lead to the machines end with them
             self._poll_interval = min(2 * self._poll_interval, LONGEST_POLL_INTERVAL)
+            reports: list[Event] = []
             try:
                 if process.run(self.vpn.health_check(self.interface), check=False,
                                timeout=self._timeout).returncode != 0:
-                    with step(self.report, '', 'VPN repair', fatal=False):
+                    with step(reports.append, '', 'VPN repair', fatal=False):
                         self._run(self.vpn.repair(self.interface, self._peers()), cancel=False)
                         self._note_owner()
-                self._poll_interval = POLL_INTERVAL
-            except FogError:
-                pass  # the step has reported a failed repair; the next check tries again
+                self._poll_interval, self._failure = POLL_INTERVAL, ''
+            except FogError as error:
+                # the next check tries again
+                before, self._failure = self._failure, str(error)
+                if before == self._failure:
+                    reports.clear()
+            for report in reports:
+                self.report(report)
             return self._poll_interval
 
     def _refresh_ticket(self) -> None:

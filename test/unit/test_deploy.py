@@ -622,8 +622,8 @@ def test_a_machine_that_boots_slowly_has_the_time_of_its_boot(launch, provider, 
     assert connection._timeout() == connecting.LOGIN_TIMEOUT
 
 
-def test_failing_repair_is_reported_ever_more_seldom(launch, events, monkeypatch):
-    failures = [FogError('no')] * 5
+def test_repair_that_keeps_failing_is_reported_once(launch, events, monkeypatch):
+    failures = [FogError('no')] * 4 + [FogError('busy')]
     answers = [False, False]
 
     def run(command, **arguments):
@@ -640,7 +640,10 @@ def test_failing_repair_is_reported_ever_more_seldom(launch, events, monkeypatch
     monkeypatch.setattr(process, 'run', run)
     assert [robot.check_health() for _ in range(9)] == [
         2.0, 4.0, 8.0, 15.0, 15.0, 15.0, 15.0, 1.0, 1.0]
-    assert len([event for event in events if isinstance(event, StepFailed)]) == 5
+    assert [event.reason for event in events if isinstance(event, StepFailed)] == ['busy', 'no']
+    failures.append(FogError('no'))
+    robot.check_health()
+    assert isinstance(events[-1], StepFailed)
 
 
 @pytest.mark.parametrize('refused', [False, True])
