@@ -32,6 +32,8 @@ from fogros2.report import (
 FILE = 'steps.jsonl'
 #: Minimum interval in seconds between two progress lines of a step.
 PROGRESS_INTERVAL = 0.25
+#: Steps from which on a step that repeats, such as a repair, drops its first one.
+MOST = 200
 _KINDS = {StepStarted: 'started', StepDone: 'done', StepFailed: 'failed', Progress: 'progress',
           ClockMeasured: 'clock'}
 
@@ -119,7 +121,7 @@ class Contents:
     """
     The contents of a journal, which grow by its lines; damaged lines are ignored.
 
-    :ivar steps: in the order in which they began.
+    :ivar steps: in the order in which they began; see ``MOST``.
     :ivar clocks: the last offset of each machine's clock.
     """
 
@@ -139,12 +141,20 @@ class Contents:
             else:
                 self._add_step(event)
 
+    def _begin(self, step: Step) -> None:
+        if len(self.steps) >= MOST:
+            first = next((i for i, entry in enumerate(self.steps) if entry.state != 'running'
+                          and (entry.machine, entry.step) == (step.machine, step.step)), None)
+            if first is not None:
+                del self.steps[first]
+        self.steps.append(step)
+
     def _add_step(self, event: dict[str, Any]) -> None:
         entries = self.steps
         machine, name = str(event['machine']), str(event['step'])
         kind, at = event['event'], float(event['time'])
         if kind == 'started':
-            entries.append(Step(machine, name, at))
+            self._begin(Step(machine, name, at))
             return
         index = next((i for i in reversed(range(len(entries))) if entries[i].state == 'running'
                       and (entries[i].machine, entries[i].step) == (machine, name)), None)
@@ -156,7 +166,7 @@ class Contents:
             seconds = float(event['seconds'])
             if index is None:
                 # a failed undo step is reported only at its end
-                entries.append(Step(machine, name, at - seconds))
+                self._begin(Step(machine, name, at - seconds))
                 index = len(entries) - 1
             entries[index] = dataclasses.replace(
                 entries[index], state=kind, seconds=seconds, detail=str(event['detail']),

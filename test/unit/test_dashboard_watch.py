@@ -120,6 +120,21 @@ def test_watched_journal_is_parsed_once(
     assert launch.contents.steps == [Step('a', 's', 1.0, done=1, total=2)]
 
 
+def test_steps_that_repeat_for_weeks_stay_few() -> None:
+    def line(kind: str, step: str, time: int) -> str:
+        return json.dumps({'time': time, 'event': kind, 'machine': 'a', 'step': step,
+                           'seconds': 1.0, 'detail': ''})
+
+    steps = journal.Contents([
+        line('started', 'boot', 0), line('done', 'boot', 1), line('started', 'image', 2),
+        *(line(kind, 'repair', time) for time in range(9000) for kind in ('started', 'done')),
+        *(line('failed', 'ticket', time) for time in range(9000))]).steps
+    assert len(steps) <= journal.MOST + 1
+    assert [step.step for step in steps[:3]] == ['boot', 'image', 'repair']
+    assert [(step.step, step.begin) for step in steps[-2:]] == [
+        ('repair', 8999.0), ('ticket', 8998.0)]
+
+
 def test_step_that_only_failed_has_its_begin() -> None:
     line = ('{"time": 10, "machine": "a", "step": "left there", "event": "failed", '
             '"seconds": 2, "detail": "silent"}')
