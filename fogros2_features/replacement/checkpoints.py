@@ -70,7 +70,8 @@ class Checkpoints:
         self._folders: dict[str, Checkpoint] = {}
         self._clients: dict[str, Any] = {}
         self._order = asyncio.Lock()
-        self._said = ''
+        #: The last warning of a folder, while it is not copied.
+        self._warned: dict[str, str] = {}
         if session.own.checkpoint:
             self.add(session.own.checkpoint)
 
@@ -165,9 +166,9 @@ class Checkpoints:
             for folder in list(self._folders.values()):
                 try:
                     await self._in_thread(act, folder)
-                    self._said = ''
+                    self._warned.pop(folder.folder, None)
                 except FogError as error:
                     text = f'{self._session.spec.name}: {folder.folder} {failed}: {error}'
-                    if text != self._said and not self._context.is_shutdown:
+                    if text != self._warned.get(folder.folder) and not self._context.is_shutdown:
                         self._logger.warning(text)
-                    self._said = text
+                    self._warned[folder.folder] = text

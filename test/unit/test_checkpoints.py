@@ -16,6 +16,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.task import Future
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
+from fogros2.errors import ShellError
 from fogros2.model import MachineSpec, NodeSpec
 from fogros2_features.replacement import checkpoints
 from fogros2_features.replacement.checkpoints import Checkpoints
@@ -94,6 +95,36 @@ def test_nodes_without_a_copy_of_their_folder_are_reported(
     assert [each.getMessage() for each in caplog.records if each.levelname == 'WARNING'] == [
         'planner: /nowhere/map is not restored: the launch has no copy of it '
         '(do the nodes write there, and not to a folder of a container?)']
+
+
+def test_each_folder_that_is_not_copied_is_reported_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture,
+) -> None:
+    class Folder:
+        def __init__(self, folder: str, *, bad: bool) -> None:
+            self.folder, self.bad = folder, bad
+
+        def save(self, shell: object, *, still: bool) -> bool:
+            if self.bad:
+                raise ShellError('it can not be read')
+            return True
+
+    session: Any = SimpleNamespace(spec=MachineSpec('planner', 'container'), own=Options())
+
+    async def save() -> None:
+        context = LaunchContext()
+        kept = Checkpoints(session, context, tmp_path, '', None, in_thread=asyncio.to_thread,
+                           logger=logging.getLogger())
+        folders = [Folder('~/a', bad=True), Folder('~/b', bad=True), Folder('~/c', bad=False)]
+        kept._folders.update({folder.folder: folder for folder in folders})  # type: ignore
+        shell: Any = None
+        for bad in (True, True, False, True):
+            folders[1].bad = bad
+            await kept.save(shell, still=False)
+
+    loops.run(save())
+    assert [each.getMessage()[9:12] for each in caplog.records if each.levelname == 'WARNING'] == [
+        '~/a', '~/b', '~/b']
 
 
 @pytest.mark.parametrize('node', [Destroyed(), Silent()])
