@@ -20,7 +20,7 @@ from fogros2.vpn import addresses, helped, owner, Vpn
 from fogros2.waiting import Periodic
 
 #: Seconds between two refreshes of sudo's ticket, which is valid for some minutes.
-TICKET_REFRESH = 30.0
+TICKET_REFRESH = 120.0
 #: Seconds that a new machine waits for the others to add it as a peer.
 UPDATE_TIMEOUT = 5.0
 #: Interval in seconds of the health check, and the longest one between attempts to repair.
