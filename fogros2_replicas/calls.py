@@ -21,6 +21,8 @@ from fogros2_replicas.figures import Figures
 HedgeAfter = Union[None, float, Literal['p95']]
 #: A replica that leaves this many requests unanswered, which others have answered, is too slow.
 BEHIND = 16
+#: Requests of one replica that may be without an answer.
+MOST = 256
 #: Seconds between two requests to a replica that is left out (PROBE), or that is not needed
 #: (REFRESH): its answers show its latency. After PROBE, a request without any answer goes to a
 #: replica that is left out. PAUSE is the first pause of requests that no replica can answer.
@@ -204,6 +206,8 @@ class Calls:
         actions: list[Action] = []
         for replica in replicas:
             replica.last = replica.sent[call] = now
+            if len(replica.sent) > MOST:
+                del replica.sent[next(iter(replica.sent))]
             one.asked.add(replica.name)
             one.failed.discard(replica.name)
             one.due = min(one.due, now + (self._delay(replica) or PROBE), one.deadline)

@@ -33,15 +33,14 @@ from rclpy.task import Future
 
 from fogros2 import ros_types
 from fogros2_replicas import figures
-from fogros2_replicas.calls import Action, Answer, Calls
+from fogros2_replicas.calls import Action, Answer, Calls, MOST
 from fogros2_replicas.pairs import Header, header_of, Pair
 from image_transport_h264 import ending
 from image_transport_h264.lazy import every, printable
 
 #: Seconds between two looks at the graph, between two writes of the figures, and after which
-#: missing names are reported. Requests of one replica that may be without an answer, and names and
-#: texts that are remembered because they were reported.
-LOOK, WRITE, MISSING, MOST, WARNINGS = 0.25, 1.0, 30.0, 256, 1000
+#: missing names are reported. Names and texts that are remembered because they were reported.
+LOOK, WRITE, MISSING, WARNINGS = 0.25, 1.0, 30.0, 1000
 #: Reads the header of a serialized message.
 Read = Callable[[bytes], Optional[Header]]
 #: Names that every node has.

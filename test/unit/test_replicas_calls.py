@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import pytest
 
 from fogros2_replicas import figures
-from fogros2_replicas.calls import Answer, BEHIND, Calls, PROBE, REFRESH, Send
+from fogros2_replicas.calls import Answer, BEHIND, Calls, MOST, PROBE, REFRESH, Send
 
 NAMES = ('a', 'b', 'c')
 
@@ -309,3 +309,14 @@ def test_each_request_gets_one_answer(seed, after, lost, failing, last):
             do(calls.ready(now, NAMES if what == 'back' else set(NAMES) - {*rest}))
     # requests may be lost by all but the last replica, which is asked in the end
     assert set(answers.values()) == {'yes'} and len(answers) == 60
+
+
+def test_replica_that_hangs_for_weeks_has_few_requests():
+    calls = ready(Calls(['a', 'b']))
+    for call in range(3 * MOST):
+        now = call * PROBE
+        sent = {action.replica for action in calls.ask(now, call)}
+        assert 'a' in sent
+        calls.answered(now, call, 'a', 'yes')
+    hanging = calls.replicas['b']
+    assert len(hanging.sent) == MOST and max(hanging.sent) == call and not hanging.live
