@@ -211,7 +211,7 @@ class FirstAnswer(Node):
         self._public: list[_Served | _Forwarded] = [
             *(_Served(self, name) for name in settings['services']),
             *(_Forwarded(self, *names) for names in settings['topics'])]
-        self._path = f"{settings['folder']}/{settings['name']}"
+        self._path, self._written = f"{settings['folder']}/{settings['name']}", ''
         # opened for writing too, so that it never ends; ``wake`` writes empty lines
         self._events = os.open(f'{self._path}.events', os.O_RDWR | os.O_NONBLOCK)
         every(self, WRITE, self._write)
@@ -325,11 +325,14 @@ class FirstAnswer(Node):
         with self.lock:
             text = json.dumps([row for one in self._public for row in figures.rows(
                 one.name, [*one.figures.replicas.values()])])
+        if text == self._written:
+            return
         try:
             with open(f'{self._path}.new', 'w', opener=functools.partial(
                     os.open, mode=0o600)) as file:
                 file.write(text)
             os.replace(f'{self._path}.new', f'{self._path}.json')
+            self._written = text
         except OSError as error:  # such as a full disk; the services go on
             self.complain(f'figures of replicas are not written: {error}')
 

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 import heapq
 import random
+from types import SimpleNamespace
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,6 +14,7 @@ import pytest
 
 from fogros2_replicas import figures
 from fogros2_replicas.calls import Answer, BEHIND, Calls, MOST, PROBE, REFRESH, Send
+from fogros2_replicas.node import FirstAnswer
 
 NAMES = ('a', 'b', 'c')
 
@@ -309,6 +312,21 @@ def test_each_request_gets_one_answer(seed, after, lost, failing, last):
             do(calls.ready(now, NAMES if what == 'back' else set(NAMES) - {*rest}))
     # requests may be lost by all but the last replica, which is asked in the end
     assert set(answers.values()) == {'yes'} and len(answers) == 60
+
+
+def test_figures_are_written_when_they_change(calls, tmp_path):
+    public = SimpleNamespace(name='/plan', figures=calls)
+    node = SimpleNamespace(
+        lock=nullcontext(), _public=[public], _path=tmp_path / 'figures', _written='')
+    file = tmp_path / 'figures.json'
+    FirstAnswer._write(node)
+    first = file.stat().st_ino
+    assert '"machine": "a"' in file.read_text()
+    FirstAnswer._write(node)
+    assert file.stat().st_ino == first
+    calls.died(1.0, 'a')
+    FirstAnswer._write(node)
+    assert 'died' in file.read_text()
 
 
 def test_replica_that_hangs_for_weeks_has_few_requests():
