@@ -53,6 +53,8 @@ class Interruptible(Session):
         self.fenced = own.replaces
         self.state = MachineState(survivable=own.on_interrupt != 'shutdown')
         self._held: list[tuple[RemoteRun, Event]] = []
+        #: What follows from the end of the agent, while exits are held back.
+        self._postponed: Optional[Callable[[], None]] = None
         self.replacer: Optional[Replacer] = None
         self.checkpoints: Optional[Checkpoints] = None
         #: Processes that have left a machine that is being replaced.
@@ -214,12 +216,18 @@ class Interruptible(Session):
             self._on('last_words')
 
     def _restarted(self) -> None:
-        if self.phase != 'ending':
-            super()._restarted()
+        self._if_spared(super()._restarted)
 
     def _agent_gone(self) -> None:
-        if self.phase != 'ending' and not (self.interrupted and self.fenced):
-            super()._agent_gone()
+        if not (self.interrupted and self.fenced):
+            self._if_spared(super()._agent_gone)
+
+    def _if_spared(self, act: Callable[[], None]) -> None:
+        """Act now, or when it is known that the machine is not gone."""
+        if self.phase == 'ending':
+            self._postponed = act
+        else:
+            act()
 
     def _on(self, event: machine_state.Event, reason: str = '') -> None:
         """
@@ -231,11 +239,16 @@ class Interruptible(Session):
         self.phase = self.state.phase
         for command in commands:
             if command == 'hold':
+                self._postponed = None
                 self._loop.call_later(_HOLD, self._on, 'spared')
             elif command == 'release':
                 held, self._held = self._held, []
+                respawning = self._respawning() if self._postponed else []
                 for run, exited in held:
-                    run.on_event(exited)
+                    if run not in respawning:
+                        run.on_event(exited)
+                if self._postponed:
+                    self._postponed()
             elif command == 'save':
                 self.request(self._last_checkpoint)
             elif command == 'announce':

@@ -256,6 +256,40 @@ def test_they_have_ended_if_the_news_never_comes(run, fake, planner, talker, wat
     assert len(watch.starts) == 1 and [code for _, code in watch.exits] == [-15]
 
 
+@pytest.mark.parametrize('respawn', [False, True])
+@pytest.mark.parametrize('reported', [False, True])
+def test_agent_of_a_spared_machine_is_restored(
+        run, fake, planner, talker, watch, monkeypatch, respawn, reported):
+    """It ended by a signal, and was started again; its nodes have ended."""
+    monkeypatch.setattr(session, '_HOLD', 0.1)
+
+    def on_start(machine, node):
+        if len(machine.all) == 1:
+            machine.say('ending', reason='SIGTERM')
+            if reported:
+                machine.say('exited', node, returncode=-15, respawns=False)
+            machine.say('restarted')
+
+    fake.on_start = on_start
+    watch.at_start = {2: end}
+    assert run(LaunchDescription([*watch(), talker(machine=planner, respawn=respawn)])) == 0
+    assert len(watch.starts) == 1 + respawn and fake.noted('restore')
+    assert watch.exits[0][1] == (-15 if reported and not respawn else -9)
+
+
+def test_agent_of_a_spared_machine_that_stays_away_is_gone(
+        run, fake, planner, talker, watch, monkeypatch):
+    monkeypatch.setattr(session, '_HOLD', 0.1)
+
+    def on_start(machine, node):
+        machine.say('ending', reason='SIGTERM')
+        machine.say('connection', state='absent', error='no agent')
+
+    fake.on_start = on_start
+    assert run(LaunchDescription([*watch(), talker(machine=planner)])) == 0
+    assert [code for _, code in watch.exits] == [-9]
+
+
 # -- streams --------------------------------------------------------------------------------------
 
 @pytest.fixture
