@@ -122,17 +122,17 @@ class WireGuard(Vpn):
         ``repair``: without them it could not reach a robot behind NAT, which would notice the lost
         session only after 15 s.
         """
-        name = _name(interface)
+        name, noted = _name(interface), _noted(interface)
         lines = [
             f'read -r carrier 2>/dev/null </sys/class/net/{name}/carrier',
             '[ "$carrier" = 1 ]']
         if interface.firewall:
-            noted = _noted(interface)
             lines.append(f'[ ! -e {noted} ] || {{ read -r _ before; '
                          f'set -- $({_FROM}); [ "$*" = "$before" ]; }} <{noted}')
         else:
             lines.append(f'found=$(wg show {name} endpoints) && '
-                         f'printf "%s\\n" "$found" >{_noted(interface)} || :')
+                         f'{{ [ "$found" = "$(cat {noted} 2>/dev/null)" ] || '
+                         f'printf "%s\\n" "$found" >{noted}; }} || :')
             due = f'{more(interface)}.due'
             lines.append(f'[ ! -e {due} ] || {{ read -r due; read -r up _ </proc/uptime; '
                          '[ "${up%.*}" -lt "$due" ] || '

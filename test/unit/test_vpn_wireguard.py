@@ -204,6 +204,25 @@ def test_endpoints_are_read_from_the_output_of_wg(
     assert (tmp_path / 'ip.in').read_text() == asked * 2
 
 
+def test_machine_writes_endpoints_when_they_change(tmp_path: Path) -> None:
+    """Of a container machine, /run is on the disk of its host."""
+    program, noted = tmp_path / 'wg', tmp_path / 'noted'
+    text = WireGuard().health_check(MACHINE).argv[-1].replace('/run/foga1b2c3m0.noted', str(noted))
+
+    def check(endpoints: str, status: int = 0) -> int:
+        program.write_text(f'#!/bin/sh\nprintf "%s" "{endpoints}"\nexit {status}\n')
+        program.chmod(0o755)
+        subprocess.run(['sh', '-ec', text[text.index('found='):]], check=True, env={
+            'PATH': f'{tmp_path}:/usr/bin:/bin'})
+        assert status or noted.read_text().rstrip() == endpoints.rstrip()
+        return noted.stat().st_mtime_ns
+
+    first = check(two := f'{KEY}\t192.0.2.1:1\n{OTHER}\t(none)\n')
+    assert check(two) == first
+    assert check('', status=1) == first
+    assert check(f'{KEY}\t192.0.2.1:1\n') != first and check('') != first
+
+
 @pytest.mark.parametrize('change', [
     {'public_key': f'{KEY}\nAllowedIPs = 0.0.0.0/0'}, {'public_key': ''},
     {'address': '0.0.0.0/0'}, {'address': '198.18.7.2\n'},
