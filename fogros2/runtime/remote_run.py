@@ -212,7 +212,7 @@ class RemoteRun:
             self._logger.error(f"process can't be started: {said['error']}{hint}")
 
     def _report_start(self, event: NodeStarted) -> None:
-        self._started_at = self._context.asyncio_loop.time()
+        self._started_at, self._returncode = self._context.asyncio_loop.time(), None
         details = self._action.process_details
         assert details is not None
         details['pid'] = event['pid']

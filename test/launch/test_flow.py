@@ -421,17 +421,23 @@ def test_remote_exit_status_is_reported(run, fake, planner, capfd):
 def test_machine_respawns_and_the_launch_sees_it(run, fake, planner):
     starts, exits = [], []
 
-    def dies_twice(machine, node):
+    def dies(machine, node):
         assert node.respawn and node.respawn_delay == 0.5 and node.respawn_max_retries == 2
         machine.say('exited', node, returncode=1, respawns=True)
         machine.say('started', node, pid=4990, cmd=['/there/program'])
-        machine.say('exited', node, returncode=0, respawns=False)
 
-    fake.on_start = dies_twice
+    def started(event, context):
+        starts.append(event.pid)
+        if event.pid == 4990:
+            assert node.return_code is None
+            machine = fake.machines['planner']
+            machine.say('exited', *machine.all, returncode=0, respawns=False)
+
+    fake.on_start = dies
     node = talker(planner, respawn=True, respawn_delay=0.5, respawn_max_retries=2)
     assert run(LaunchDescription([
         RegisterEventHandler(OnProcessStart(
-            target_action=node, on_start=lambda event, context: starts.append(event.pid))),
+            target_action=node, on_start=started)),
         RegisterEventHandler(OnProcessExit(
             target_action=node,
             on_exit=lambda event, context: exits.append(event.returncode))),
