@@ -467,7 +467,7 @@ def booted(tmp_path):
     def run(told, **variables):
         script = told['bootcmd'][0][2]
         for path in ('/opt/fogros2', '/run/fogros2', '/var/log', '/root/.ssh',
-                     '/etc/needrestart'):
+                     '/etc/needrestart', '/var/lib/systemd'):
             (tmp_path / path.lstrip('/')).parent.mkdir(parents=True, exist_ok=True)
             script = script.replace(path, f'{tmp_path}{path}')
         (tmp_path / 'var/log').mkdir(exist_ok=True)
@@ -551,6 +551,11 @@ def test_updates_of_the_system_do_not_restart_the_agent(booted):
     top = booted(config(machine='planner', directory='/run/fogros2'))
     settings = top / 'etc/needrestart/conf.d/fogros2.conf'
     assert settings.read_text() == '$nrconf{override_rc}{qr(^fogros2-agent)} = 0;\n'
+
+
+def test_nodes_keep_shared_memory_while_nobody_is_logged_in(booted):
+    top = booted(config(machine='planner', directory='/run/fogros2'))
+    assert (top / 'var/lib/systemd/linger/ubuntu').exists()
 
 
 def test_keys_that_an_image_brings_along_are_taken_away_once(booted, tmp_path):

@@ -80,6 +80,9 @@ cat >{folder}/watchdog.sh <<'{mark}'
 # Ubuntu restarts units after an update of a library, and all nodes run in the agent's
 mkdir -p /etc/needrestart/conf.d
 echo '$nrconf{{override_rc}}{{qr(^fogros2-agent)}} = 0;' >/etc/needrestart/conf.d/fogros2.conf
+# logind would remove the user's shared memory and runtime folder after the last logout
+mkdir -p /var/lib/systemd/linger
+touch /var/lib/systemd/linger/{user}
 # a unit of its own: it must not end with this step of the boot
 systemd-run --no-block --unit=fogros2-agent --property=DefaultDependencies=no \\
     --property=Restart=always /bin/sh {folder}/watchdog.sh >/dev/null 2>&1 \\
