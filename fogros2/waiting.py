@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Callable, Iterator
 from concurrent import futures
 import contextlib
 import dataclasses
+import sys
 import threading
 import time
+from types import ModuleType
 from typing import Optional, TypeVar
 
 from fogros2.errors import Cancelled, DeadlineExceeded
@@ -18,6 +21,8 @@ T = TypeVar('T')
 _doing: dict[int, list[str]] = {}
 #: Seconds to wait for the answer to a sent request, which may create something, after a cancel.
 ON_ITS_WAY = 15.0
+#: Seconds for which the end of the process waits for an import.
+_IMPORT = 5.0
 #: Seconds for a machine to write its memory's files to a disk: 400 GB at 125 MB/s.
 TO_DISK = 3600.0
 
@@ -124,6 +129,22 @@ class Periodic:
     def close(self) -> None:
         """Stop the calls; one that is under way goes on."""
         self._stop.set()
+
+
+def _await_imports() -> None:
+    """
+    Wait for imports of daemon threads at the end of the process.
+
+    Rust aborts a process that ends a thread during the import of a module in Rust.
+    """
+    deadline = time.monotonic() + _IMPORT
+    while time.monotonic() < deadline and any(
+            getattr(getattr(module, '__spec__', None), '_initializing', False)
+            for module in list(sys.modules.values()) if type(module) is ModuleType):
+        time.sleep(0.01)
+
+
+atexit.register(_await_imports)
 
 
 def in_thread(call: Callable[[], T]) -> futures.Future[T]:

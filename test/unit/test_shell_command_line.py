@@ -112,6 +112,20 @@ def test_paramiko_is_imported_late_and_without_invoke():
     subprocess.run([sys.executable, '-c', code], check=True)
 
 
+@pytest.mark.parametrize(('kind', 'library'), [('ssh', 'paramiko'), ('kubernetes', 'kubernetes')])
+def test_exit_waits_for_import_of_library(tmp_path, kind, library):
+    (tmp_path / f'{library}.py').write_text(
+        "import threading\nthreading.main_thread().join()\nprint('imported', flush=True)\n")
+    code = (
+        'import sys\nfrom fogros2 import shell, waiting\n'
+        f'shell.warm({kind!r})\n'
+        f"waiting.wait_until(lambda: {library!r} in sys.modules, timeout=60.0, what='its begin')\n"
+        'sys.setswitchinterval(9)\n')
+    done = subprocess.run([sys.executable, '-c', code], check=True, capture_output=True, text=True,
+                          env={**os.environ, 'PYTHONPATH': str(tmp_path)})
+    assert done.stdout == 'imported\n' and done.stderr == ''
+
+
 def test_warnings_of_paramikos_import_are_not_shown(tmp_path):
     """Its older versions name a cipher of which newer versions of cryptography warn."""
     (tmp_path / 'paramiko.py').write_text(
