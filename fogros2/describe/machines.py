@@ -377,10 +377,23 @@ def _listed(program: str, content: Any) -> list[Union[values.Items, values.List]
     return [] if items is None else [items]
 
 
+def _lifetime(keyword: str, value: Union[str, int, float]) -> float:
+    """
+    Convert a lifetime to seconds.
+
+    :raises ConfigurationError: it is no duration, or hours or minutes without their unit.
+    """
+    seconds = values.parse_duration(keyword, value)
+    if seconds < 60 and not str(value)[-1:].isalpha():
+        raise ConfigurationError(f'{keyword}={value!r} would be {seconds:g} seconds',
+                                 f"write the unit, such as '{seconds:g}h' or '{seconds:g}s'")
+    return seconds
+
+
 _CHECKS: dict[str, Any] = {
     'on_exit': values.choice(OnExit),
     'bootstrap': values.choice(Bootstrap),
-    'lifetime': values.parse_duration,
+    'lifetime': _lifetime,
     'robot_timeout': values.parse_duration,
 }
 #: Keywords of every machine that a file of defaults may have.

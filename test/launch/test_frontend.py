@@ -159,7 +159,7 @@ CHOICES = {'on_exit': 'keep', 'bootstrap': 'apt', 'on_interrupt': 'robot', 'on_l
            'checkpoint': '$HOME/map', 'checkpoint_interval': '5m', 'max_replacements': '2',
            'bandwidth': '10Mbit/s', 'launch_budget': '$20',
            'name': 'planner', 'budget': '5 USD', 'idle_timeout': '5m', 'vpn_path': 'stream',
-           'fetch_to': '/results', 'fetch_limit': '2GB'}
+           'fetch_to': '/results', 'fetch_limit': '2GB', 'lifetime': '90s'}
 LISTS = {'docker_containers': ('docker run a, docker run b', ['docker run a', 'docker run b']),
          'fetch': ('~/bags, /var/map', ['~/bags', '/var/map']),
          'record': ('/tf, /scan', ['/tf', '/scan']),

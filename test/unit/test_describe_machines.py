@@ -118,6 +118,8 @@ def test_substitutions_are_resolved_when_executed(context):
     (lambda: ContainerInstance(bootstrap='embedded'), 'use one of auto, apt, pip, none'),
     (lambda: ContainerInstance(on_exit='keep'), "a machine with on_exit='keep' needs a name"),
     (lambda: ContainerInstance(lifetime='soon'), 'is no duration'),
+    (lambda: ContainerInstance(lifetime=8), "lifetime=8 would be 8 seconds (write the unit, such "
+     "as '8h' or '8s')"),
     (lambda: ContainerInstance(idle_timeout='soon'), "idle_timeout='soon' is no duration"),
     (lambda: CloudInstance(), 'CloudInstance is no machine yet'),
     (lambda: ContainerInstance(apt='libzbar0'), "apt='libzbar0' is no list (apt=['libzbar0'])"),
