@@ -34,7 +34,7 @@ _LAST_EVENTS = ('watchdog', 'ending')
 _HOLD = 60.0
 #: Seconds in which the provider may confirm a notice; EC2 gives two minutes' notice.
 _CONFIRM = 150.0
-#: Seconds before the end of its lifetime from which a machine that is lost is not replaced.
+#: Seconds before the end of its lifetime from which a machine that is lost counts as over.
 _LAST = 60.0
 #: Seconds until processes are started again that a machine did not start.
 _AGAIN = 1.0
@@ -283,10 +283,11 @@ class Interruptible(Session):
 
     def go_on(self, event: MachineInterrupted, remedy: str = '') -> list[Action]:
         """Apply ``on_interrupt``; return what this needs; see the base class."""
+        if self.own.on_interrupt != 'robot' and event.lost and (
+                self.running is not None and self.running.time_left < _LAST):
+            return super().go_on(event, 'its time was over: raise lifetime=, or the budget '
+                                 'that shortens it')
         if self.replacer is not None:
-            if event.lost and self.running is not None and self.running.time_left < _LAST:
-                return super().go_on(event, 'its time was over: raise lifetime=, or the budget '
-                                     'that shortens it')
             self._logger.warning(f'{event}; a new machine will continue its nodes')
             self.replacer.on('lost' if event.lost else 'notice')
             return []

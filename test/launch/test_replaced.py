@@ -125,7 +125,9 @@ def test_nodes_of_the_last_lost_machine(run, fake, package, talker, watch, capfd
     assert rest in said.out + said.err
 
 
-def test_machine_at_the_end_of_its_lifetime_is_not_replaced(run, fake, planner, watch, capfd):
+@pytest.mark.parametrize('how', ['replace', 'shutdown'])
+def test_machine_at_the_end_of_its_lifetime_is_not_replaced(run, fake, watch, capfd, how):
+    planner = ContainerInstance(name='planner', ros_workspace='', on_interrupt=how)
     node = CloudNode(machine=planner, package='absent', executable='says')
     planner._options['image'] = 'mine'
 
