@@ -34,6 +34,8 @@ class FogMachine(Action):
         super().__init__(**kwargs)
         self._provider = provider
         self._given = dict(given)
+        #: The machine's name as the launch file gives it.
+        self.name = self._given.get('name', 'fog_machine')
         #: The machine; None until the provider is resolved.
         self.machine: Optional[CloudInstance] = None
         if isinstance(provider, str):

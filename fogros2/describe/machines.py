@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 import functools
 import os
 import shlex
@@ -359,6 +359,14 @@ def checked(machine: SomeMachine) -> SomeMachine:
             f'machine={machine!r} is no machine',
             'pass one such as ContainerInstance(), or the name of one')
     return machine
+
+
+def unknown_machine(name: str, known: Collection[str]) -> ConfigurationError:
+    """Return the error for a name of none of a launch's machines."""
+    return ConfigurationError(
+        f"this launch has no machine named '{name}'",
+        did_you_mean(name, known,
+                     'name one that the launch file describes before, or pass the machine itself'))
 
 
 _LIST_CHECKS = {'apt': dependencies.check_apt, 'pip': dependencies.check_pip}

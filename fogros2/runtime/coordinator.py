@@ -37,8 +37,8 @@ from launch.substitutions import SubstitutionFailure
 from fogros2 import feature
 from fogros2.describe import defaults, values
 from fogros2.describe.keywords import ROBOT
-from fogros2.describe.machines import CloudInstance
-from fogros2.errors import Cancelled, ConfigurationError, did_you_mean, FogError
+from fogros2.describe.machines import CloudInstance, unknown_machine
+from fogros2.errors import Cancelled, ConfigurationError, FogError
 from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
 from fogros2.runtime import added_process, cost, signals
@@ -426,11 +426,7 @@ class Coordinator:
             # a resolved name differs from the key of a name that was a substitution
             if name in (known, instance.name):
                 return instance
-        raise ConfigurationError(
-            f"this launch has no machine named '{name}'",
-            did_you_mean(
-                name, self._instances,
-                'name one that the launch file describes before, or pass the machine itself'))
+        raise unknown_machine(name, self._instances)
 
     def _set_dds_environment(self) -> None:
         environment = self.launch.robot_environment()

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 from decimal import Decimal
+import os
 from typing import Any, Optional
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity, Substitution
@@ -25,14 +26,17 @@ from launch.substitutions import Command, SubstitutionFailure
 
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
+from fogros2.deploy.checks import check_here
 from fogros2.deploy.choosing import Choices
 from fogros2.describe import defaults, values
 from fogros2.describe.keywords import ROBOT
-from fogros2.describe.machines import CloudInstance
+from fogros2.describe.machines import CloudInstance, unknown_machine
 from fogros2.describe.overrides import Overrides
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, FogError
 from fogros2.launch_internals.wrapping import below
 from fogros2.model import MachineSpec
+from fogros2.provider import Provider
+from fogros2.runtime.node_spec import program_of
 from fogros2.runtime.remote_process import remote_of
 
 #: Raised by substitutions and conditions that only a launch can evaluate, by wrong values, and by
@@ -52,13 +56,17 @@ class Planned:
 
     :param spec: None for the robot, and for a machine whose values are known at launch only.
     :param note: why there is no spec.
+    :param error: for which a launch refuses the machine.
     :param nodes: programs, or command lines.
+    :param programs: the (package, executable) pairs that run there in any case.
     """
 
     name: str
     spec: Optional[MachineSpec] = None
     note: str = ''
+    error: Optional[FogError] = None
     nodes: list[str] = dataclasses.field(default_factory=list)
+    programs: list[tuple[str, str]] = dataclasses.field(default_factory=list)
 
     def lines(self, price: Optional[Decimal] = None) -> Iterator[str]:
         """
@@ -94,6 +102,7 @@ class Preview:
 
     :param arguments: launch arguments.
     :param overrides: of ``--machine``.
+    :raises ConfigurationError: an override matches no machine.
     """
 
     def __init__(
@@ -107,13 +116,24 @@ class Preview:
         self._on_robot: set[str] = set()
         #: Whether a function or an unread file may add something.
         self.open = False
+        #: Whether all machines of the launch file are known.
+        self._whole = True
         self._look(description.entities)
+        if self._whole and not self.open:
+            self._check_names()
 
     @property
     def machines(self) -> list[Planned]:
         """The machines, then the robot if it has nodes."""
         robot = [self._machines[ROBOT]] if ROBOT in self._machines else []
         return [one for one in self._machines.values() if one.name != ROBOT] + robot
+
+    def _check_names(self) -> None:
+        described = [one.name for one in self._machines.values() if one.spec is not None]
+        for name in self._machines.keys() - {*described, ROBOT}:
+            self._machines[name].error = unknown_machine(name, described)
+        if self._overrides is not None:
+            self._overrides.check([*described, *self._on_robot])
 
     def lines(self, prices: Mapping[str, Decimal] = {}) -> Iterator[str]:
         """
@@ -134,6 +154,7 @@ class Preview:
             try:
                 condition = getattr(entity, 'condition', None)
                 if condition is not None and not condition.evaluate(self._context):
+                    self._whole = False
                     continue
             except _UNKNOWN:
                 own = ' (under a condition)'
@@ -145,12 +166,17 @@ class Preview:
                 with contextlib.suppress(_UNKNOWN):
                     entity.execute(self._context)
             elif isinstance(entity, FogMachine):
-                with contextlib.suppress(_UNKNOWN):
+                try:
                     self._name(entity.described(self._context))
+                except _UNKNOWN as error:
+                    self._refused(self._text(entity.name), '', error)
             elif isinstance(entity, ExecuteLocal):
                 remote = remote_of(entity)
-                at = where if remote is None else self._name(remote.machine)
-                self._planned(at).nodes.append(self._program(entity) + own)
+                planned = self._planned(where if remote is None else self._name(remote.machine))
+                planned.nodes.append(self._program(entity) + own)
+                program = program_of(entity) if remote is None else remote.planned[1]
+                if program is not None and not own:
+                    planned.programs.append(program)
             else:
                 self.open = self.open or isinstance(entity, OpaqueFunction)
                 self._inside(entity, where, own)
@@ -189,7 +215,11 @@ class Preview:
     def _name(self, machine: Any) -> str:
         """Return the name under which a machine is planned, the robot's for one that runs here."""
         if not isinstance(machine, CloudInstance):
-            name = self._text(machine)
+            try:
+                name: str = values.resolve(self._context, machine)
+            except _UNKNOWN:
+                self._whole = False
+                return str(values.describe(machine))
             return ROBOT if name in self._on_robot else name
         try:
             spec = defaults.resolved(machine, self._overrides, self._context)
@@ -199,8 +229,14 @@ class Preview:
             self._planned(spec.name).spec = spec
             return spec.name
         except _UNKNOWN as error:
-            self._planned(machine.name).note = f'{machine.provider}: {error}'
-            return machine.name
+            return self._refused(machine.name, f'{machine.provider}: ', error)
+
+    def _refused(self, name: str, provider: str, error: Exception) -> str:
+        self._whole = False
+        planned = self._planned(name)
+        planned.note = f'{provider}{error}'
+        planned.error = error if isinstance(error, FogError) else None
+        return name
 
 
 def arguments(words: Sequence[str]) -> dict[str, str]:
@@ -219,15 +255,22 @@ def arguments(words: Sequence[str]) -> dict[str, str]:
     return mapping
 
 
-def priced(spec: MachineSpec, choices: Choices) -> tuple[MachineSpec, Optional[Decimal]]:
+def priced(
+    machine: Planned, choices: Choices, provider: Callable[[str], Provider],
+) -> Optional[Decimal]:
     """
-    Make the open choices of a machine as a launch would; return its price, if it is known.
+    Check a machine and make its open choices as a launch would; return its price, if it is known.
 
-    :raises FogError: nothing fits, or a cloud does not answer.
+    :raises FogError: a launch refuses the machine, nothing fits, or a cloud does not answer.
     """
-    spec = dataclasses.replace(spec, options=values.await_all(spec.options))
-    chosen = choices.resolved(choices.places(spec)[0])
-    return chosen, choices.price(chosen)
+    if machine.error is not None:
+        raise machine.error
+    if machine.spec is None:
+        return None
+    spec = dataclasses.replace(machine.spec, options=values.await_all(machine.spec.options))
+    check_here(spec, provider(spec.provider), machine.programs, os.environ)
+    machine.spec = choices.resolved(choices.places(spec)[0])
+    return choices.price(machine.spec)
 
 
 def _short(value: Any) -> str:

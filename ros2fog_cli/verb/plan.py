@@ -19,8 +19,13 @@ class PlanVerb(VerbExtension):
         add_overrides(parser)
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Ask the clouds for regions, types and prices, and create nothing; 1 if one refuses."""
+        """
+        Check the machines as a launch does, ask for types and prices, and create nothing.
+
+        :return: 1 if a launch would refuse a machine.
+        """
         from decimal import Decimal
+        import functools
         import os
 
         from launch.launch_description_sources import get_launch_description_from_any_launch_file
@@ -45,14 +50,13 @@ class PlanVerb(VerbExtension):
                                          'ros2 launch FILE -s shows where') from error
             plan = preview.Preview(description, preview.arguments(args.launch_arguments),
                                    Overrides(args.machine) if args.machine else None)
-            choices, prices, failed = Choices(provider, silent), {}, 0
+            providers = functools.cache(provider)
+            choices, prices, failed = Choices(providers, silent), {}, 0
             with progress.working('asking for prices'):
                 for machine in plan.machines:
-                    if machine.spec is None:
-                        continue
                     try:
                         with defaults.named(os.environ):
-                            machine.spec, price = preview.priced(machine.spec, choices)
+                            price = preview.priced(machine, choices, providers)
                         if price is not None:
                             prices[machine.name] = price
                     except FogError as error:

@@ -61,6 +61,9 @@ class Cloud(FakeProvider):
     capabilities = Capabilities(choices=True)
     asked: list[str] = []
 
+    def check(self, spec: MachineSpec) -> None:
+        self.asked.append(f'check {spec.name}')
+
     def resolve(self, spec: MachineSpec) -> MachineSpec:
         self.asked.append(f'resolve {spec.name}')
         if spec.name == 'c':
@@ -78,6 +81,7 @@ class Cloud(FakeProvider):
 def cloud(monkeypatch: pytest.MonkeyPatch) -> type[Cloud]:
     Cloud.asked = []
     instead(monkeypatch, 'fogros2.provider', {'aws': Cloud, 'container': FakeProvider})
+    monkeypatch.setattr('fogros2.shell.warm', lambda kind: None)
     return Cloud
 
 
@@ -228,22 +232,48 @@ def test_plan_asks_for_prices_and_creates_nothing(tmp_path, capsys, cloud):
   <fog_machine name="b" provider="aws"/>
   <fog_machine name="c" provider="aws"/>
   <fog_machine name="d" provider="container"/>
-  <cloud_node machine="a" pkg="demo" exec="talker"/>
+  <cloud_node machine="a" pkg="fogros2_examples" exec="talker"/>
 </launch>
 """)
     assert main(argv=['fog', 'plan', str(path)]) == 1
     said = capsys.readouterr()
     assert said.out == """a: aws (ec2_instance_type=t3.large, region=eu-west-1), $0.0416 an hour
-    demo talker
+    fogros2_examples talker
 b: aws (ec2_instance_type=t3.large), $0.0416 an hour
 c: aws
 d: container
 All machines: $0.0832 an hour
 """
     assert said.err == 'c: no credentials (log in)\n'
-    assert cloud.asked == ['resolve a', 'resolve b', 'resolve c']
+    assert cloud.asked == [f'{what} {name}' for name in 'abc' for what in ('check', 'resolve')]
     assert main(argv=['fog', 'plan', str(path), '--machine', 'c=robot']) == 0
     assert 'c: aws' not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('body', 'error'), [
+    (['<fog_machine name="m" provider="container" memory="4x"/>'],
+     "m: a fake machine has no option 'memory'"),
+    (['<fog_machine name="m" provider="$(var where)"/>'], "m: there is no provider 'contaner'"),
+    (['<cloud_node machine="q" pkg="fogros2_examples" exec="talker"/>'],
+     "q: this launch has no machine named 'q'"),
+    (['<fog_machine name="m" provider="container"/>',
+      '<cloud_node machine="m" pkg="fogros2_examples" exec="talkr"/>'], "did you mean 'talker'?"),
+])
+def test_plan_refuses_what_a_launch_refuses(tmp_path, capsys, body, error):
+    path = tmp_path / 'x.launch.xml'
+    path.write_text('\n'.join(['<launch><arg name="where" default="contaner"/>', *body,
+                               '</launch>']))
+    assert main(argv=['fog', 'plan', str(path)]) == 1
+    assert error in capsys.readouterr().err
+
+
+def test_plan_refuses_override_without_machine():
+    described = [node(ContainerInstance(name='first'))]
+    with pytest.raises(ConfigurationError, match="no machine of this name.*mean 'first'"):
+        lines(described, ['frist=container'])
+    # the launch knows the machines of conditions that do not hold
+    off = node(ContainerInstance(name='other'), condition=IfCondition('false'))
+    assert lines([*described, off], ['other=container'])
 
 
 def test_plan_of_a_missing_file_is_an_error(tmp_path):
