@@ -26,7 +26,8 @@ The tree of all errors with a known cause::
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+import contextlib
 import difflib
 from typing import Optional, TYPE_CHECKING
 
@@ -155,6 +156,18 @@ class Cancelled(FogError):
 
     def __init__(self, what: str = 'the deployment') -> None:
         super().__init__(f'{what} was cancelled')
+
+
+@contextlib.contextmanager
+def naming(machine: str) -> Iterator[None]:
+    """Put a machine's name before the message of an error that does not have the name."""
+    try:
+        yield
+    except FogError as error:
+        message = str(error.args[0])
+        if f"'{machine}'" not in message:
+            error.args = (f'{machine}: {message}',)
+        raise
 
 
 def did_you_mean(

@@ -38,6 +38,7 @@ from fogros2.errors import (
     DdsError,
     FogError,
     MachineNotFound,
+    naming,
     PrerequisiteError,
     StoreError,
 )
@@ -109,9 +110,10 @@ class Launch:
             check_here, spec, self.provider(spec.provider), programs.get(spec.name, ()),
             self.user_environment)) for spec in specs]
         done = futures.wait(answers, _QUICK, futures.FIRST_EXCEPTION).done
-        for answer in answers:
+        for spec, answer in zip(specs, answers):
             if answer in done:
-                answer.result()
+                with naming(spec.name):
+                    answer.result()
         self._others = [
             other for spec in specs
             if (other := self.provider(spec.provider).other_vpn(spec)) is not None]
@@ -135,10 +137,11 @@ class Launch:
         plan.check_security(self.user_environment, specs)
         self._check_router(specs)
         for spec in specs:
-            check(spec, self.provider(spec.provider), environment=self.user_environment,
-                  programs=programs_of(nodes.get(spec.name, ())), report=self.report)
+            with naming(spec.name):
+                check(spec, self.provider(spec.provider), environment=self.user_environment,
+                      programs=programs_of(nodes.get(spec.name, ())), report=self.report)
         with ThreadPoolExecutor(max(1, len(specs)), 'fog-choose') as pool:
-            choices = [pool.submit(self._choose, spec) for spec in specs]
+            choices = [pool.submit(naming(spec.name)(self._choose), spec) for spec in specs]
             chosen = [choice.result() for choice in choices]
         check_together([cost.spec for cost in self.costs() if not cost.ended])
         # each counts what all cost

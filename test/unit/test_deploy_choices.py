@@ -57,6 +57,13 @@ def create(launch, spec=SPEC):
     return mine
 
 
+def test_error_of_checks_and_choices_names_the_machine(launch, provider):
+    for step in ('check', 'resolve'):
+        provider.failures[step] = ProviderError('the region has no such type')
+        with pytest.raises(ProviderError, match='^planner: the region has no such type'):
+            launch.prepare([SPEC])
+
+
 def test_choices_are_made_once_and_shown_with_the_price(
         launch, provider, events):
     launch.prepare([SPEC])
