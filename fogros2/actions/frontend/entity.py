@@ -112,25 +112,31 @@ def _wrong(entity: Entity, keyword: kinds.Keyword, raw: object) -> Configuration
                               f'it takes {_EXPECTED[keyword.kind]}')
 
 
-def children(entity: Entity, name: str) -> list[Entity]:
+def children(entity: Entity, name: str, attributes: Iterable[str] = ()) -> list[Entity]:
     """
     Return the child elements with this name.
 
-    :raises ConfigurationError: YAML has another value there.
+    :param attributes: of each element, for the error.
+    :raises ConfigurationError: there is another value, such as an attribute.
     """
+    cause = None
     try:
         elements: Optional[list[Entity]] = entity.get_attr(
             name, data_type=List[Entity], optional=True)
     except TypeError as error:
+        elements, cause = None, error
+    if cause is not None or elements is None and _is_text(entity, name):
+        xml = ' '.join(f'{each}="..."' for each in attributes) or '...'
+        yaml = ', '.join(f'{each}: ...' for each in attributes) or '...'
         raise ConfigurationError(
             f"{entity.type_name}: '{name}' is no list of elements",
-            'write - {name: ..., value: ...} for each') from error
+            f'write <{name} {xml}/> in XML, - {{{yaml}}} in YAML, for each') from cause
     return elements or []
 
 
 def _mapping(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
     entries: dict[str, ParsedText] = {}
-    for child in children(entity, keyword.name):
+    for child in children(entity, keyword.name, ('name', 'value')):
         name, content = attribute(child, parser, 'name'), attribute(child, parser, 'value')
         complete(child, ('name', 'value'))
         if not isinstance(name, str) or content is None:
@@ -143,7 +149,7 @@ def _mapping(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
 
 def _table(entity: Entity, parser: Parser, keyword: kinds.Keyword) -> Any:
     rows: list[Mapping[str, Any]] = []
-    for child in children(entity, keyword.name):
+    for child in children(entity, keyword.name, keyword.columns):
         columns = {name: value(child, parser, kinds.Keyword(name, kind))
                    for name, kind in keyword.columns.items()}
         complete(child, keyword.columns)
@@ -163,7 +169,10 @@ def complete(entity: Entity, known: Iterable[str], what: str = '') -> None:
         entity.assert_entity_completely_parsed()
     except ValueError as error:
         match = _UNREAD.search(str(error))
-        names = sorted(ast.literal_eval(match[1])) if match is not None else []
+        names = sorted(map(str, ast.literal_eval(match[1]))) if match is not None else []
+        if 'True' in names:
+            raise ConfigurationError(f"{what or entity.type_name} has no 'true'",
+                                     "YAML reads on as true: write 'on' in quotes") from error
         if not names:
             raise ConfigurationError(str(error), 'take it out') from error
         # an older launch_ros does not read all that is known
