@@ -56,14 +56,30 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
         allowed = {name: keyword for each in ([provider] if provider else keywords.providers())
                    for name, keyword in _allowed(keywords.machine_class(each)).items()}
         for name, value in table.items():
-            if name not in allowed:
-                raise kinds.unknown(f"{path}: [{provider or 'machines'}]", name, allowed)
             with values.named(str(path)):
+                _check_name(provider, name, value, allowed)
                 kinds.check({name: allowed[name]}, {name: value})
                 if name in SETTINGS:
                     check_setting(name, value)
                 features.own({name: value})
     return tables
+
+
+def _check_name(provider: str, name: str, value: Any, allowed: Collection[str]) -> None:
+    """
+    Check that a file may set a keyword.
+
+    :param provider: whose table has it, '' for the lines before the first table.
+    :raises ConfigurationError: it may not.
+    """
+    if name in allowed:
+        return
+    if not provider and isinstance(value, dict):
+        keywords.machine_class(name)
+    for each in [provider] if provider else keywords.providers():
+        if name in keywords.keywords(keywords.machine_class(each)):
+            raise ConfigurationError(f"only a launch file can set '{name}'", 'take it out here')
+    raise kinds.unknown(f'[{provider}]' if provider else 'a machine', name, allowed)
 
 
 def check(environment: Mapping[str, str]) -> None:

@@ -131,7 +131,10 @@ def parse(text: str) -> Override:
         if not equals:
             raise ConfigurationError(f"--machine '{text}': '{setting}' is no keyword=value",
                                      'such as region=eu-west-1')
-        if name not in parameters or name == 'name':
+        if name == 'name':
+            raise ConfigurationError(f"--machine '{text}': a machine keeps its name",
+                                     'leave name= out, or change it in the launch file')
+        if name not in parameters:
             raise unknown(f"a machine of the provider '{provider}'", name, parameters)
         options[name] = keywords.read(parameters[name], value)
     override = Override(pattern.strip(), provider, options)

@@ -128,6 +128,7 @@ def test_a_name_beats_a_pattern_and_the_last_one_counts():
     ('planner=aws,regoin=x', ["'regoin'", "did you mean 'region'"]),
     ('planner=aws,spot', ["'spot'", 'keyword=value']),
     ('planner=aws,spot=perhaps', ['spot:', 'neither']),
+    ('planner=aws,name=other', ['keeps its name']),
     ('planner=ssh', ['needs host']),
     ('planner=aws,tags=team', ['tags:', '{name: value}']),
 ])

@@ -105,8 +105,11 @@ def test_workspace_wins_over_user_and_overlay_over_underlay(own, tmp_path, monke
 @pytest.mark.parametrize(('text', 'message', 'hint'), [
     ("lifetme = '2h'", "has no 'lifetme'", "did you mean 'lifetime'?"),
     ("[aws]\nregoin = 'x'", r"\[aws\] has no 'regoin'", "did you mean 'region'?"),
-    ("on_exit = 'keep'", "has no 'on_exit'", ''), ("name = 'a'", "has no 'name'", ''),
-    ("[ssh]\nhost = 'a'", "has no 'host'", ''),
+    ("on_exit = 'keep'", "only a launch file can set 'on_exit'", ''),
+    ("name = 'a'", "only a launch file can set 'name'", ''),
+    ("[ssh]\nhost = 'a'", "only a launch file can set 'host'", ''),
+    ("[AWS]\nregion = 'a'", "there is no provider 'AWS'", 'there are: aws'),
+    ("[machines]\nlifetime = '2h'", "there is no provider 'machines'", ''),
     ('lifetime = [1]', 'wrong type', ''), ("ssh_from = 'a'", 'is no list', "ssh_from=['a']"),
     ('[aws]\ndisk_size = true', 'wrong type', 'number'),
     ('lifetime = ', "can't be read", 'TOML'), (f"x = {'[' * 5000}", "can't be read", ''),
