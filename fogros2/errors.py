@@ -160,12 +160,12 @@ class Cancelled(FogError):
 
 @contextlib.contextmanager
 def naming(machine: str) -> Iterator[None]:
-    """Put a machine's name before the message of an error that does not have the name."""
+    """Put a machine's name, if it has one, before the message of an error without the name."""
     try:
         yield
     except FogError as error:
         message = str(error.args[0])
-        if f"'{machine}'" not in message:
+        if machine and f"'{machine}'" not in message and not message.startswith(f'{machine}: '):
             error.args = (f'{machine}: {message}',)
         raise
 

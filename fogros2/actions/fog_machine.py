@@ -9,6 +9,7 @@ from typing import Any, Optional, TYPE_CHECKING
 from launch import Action, LaunchContext
 
 from fogros2.describe import keywords, values
+from fogros2.errors import naming
 from fogros2.runtime.coordinator import Coordinator
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class FogMachine(Action):
         #: The machine; None until the provider is resolved.
         self.machine: Optional[CloudInstance] = None
         if isinstance(provider, str):
-            self.machine = keywords.make(provider, self._given)
+            self.machine = self._made(provider, self._given)
 
     def execute(self, context: LaunchContext) -> None:
         """Create the machine's description, and register its name with the launch."""
@@ -53,10 +54,14 @@ class FogMachine(Action):
         if self.machine is None:
             provider = values.resolve(context, self._provider)
             parameters = keywords.keywords(keywords.machine_class(provider))
-            self.machine = keywords.make(provider, {
+            self.machine = self._made(provider, {
                 name: value for name, value in self._given.items()
                 if name in parameters or not self._is_empty(context, value)})
         return self.machine
+
+    def _made(self, provider: str, given: Mapping[str, Any]) -> CloudInstance:
+        with naming(self.name if isinstance(self.name, str) else ''):
+            return keywords.make(provider, given)
 
     @staticmethod
     def _is_empty(context: LaunchContext, value: Any) -> bool:

@@ -34,7 +34,7 @@ class PlanVerb(VerbExtension):
         from fogros2.deploy.choosing import Choices
         from fogros2.describe import defaults
         from fogros2.describe.overrides import Overrides
-        from fogros2.errors import ConfigurationError, FogError
+        from fogros2.errors import ConfigurationError, FogError, naming
         from fogros2.launch_internals import hints
         from fogros2.report import silent
         from fogros2.runtime import log_files
@@ -46,8 +46,8 @@ class PlanVerb(VerbExtension):
             try:
                 description = get_launch_description_from_any_launch_file(args.file)
             except Exception as error:
-                raise ConfigurationError(f"'{args.file}' can't be read: {error}",
-                                         'ros2 launch FILE -s shows where') from error
+                raise ConfigurationError(
+                    f"'{args.file}' can't be read: {error}", 'correct the file') from error
             plan = preview.Preview(description, preview.arguments(args.launch_arguments),
                                    Overrides(args.machine) if args.machine else None)
             providers = functools.cache(provider)
@@ -55,12 +55,12 @@ class PlanVerb(VerbExtension):
             with progress.working('asking for prices'):
                 for machine in plan.machines:
                     try:
-                        with defaults.named(os.environ):
+                        with naming(machine.name), defaults.named(os.environ):
                             price = preview.priced(machine, choices, providers)
                         if price is not None:
                             prices[machine.name] = price
                     except FogError as error:
-                        warn(f'{machine.name}: {error}')
+                        warn(str(error))
                         failed = 1
         say('\n'.join(plan.lines(prices)) or 'The launch file has no machines and no nodes.')
         if len(prices) > 1:

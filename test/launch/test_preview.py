@@ -255,7 +255,7 @@ All machines: $0.0832 an hour
      "m: a fake machine has no option 'memory'"),
     (['<fog_machine name="m" provider="$(var where)"/>'], "m: there is no provider 'contaner'"),
     (['<cloud_node machine="q" pkg="fogros2_examples" exec="talker"/>'],
-     "q: this launch has no machine named 'q'"),
+     "this launch has no machine named 'q'"),
     (['<fog_machine name="m" provider="container"/>',
       '<cloud_node machine="m" pkg="fogros2_examples" exec="talkr"/>'], "did you mean 'talker'?"),
 ])
@@ -264,7 +264,8 @@ def test_plan_refuses_what_a_launch_refuses(tmp_path, capsys, body, error):
     path.write_text('\n'.join(['<launch><arg name="where" default="contaner"/>', *body,
                                '</launch>']))
     assert main(argv=['fog', 'plan', str(path)]) == 1
-    assert error in capsys.readouterr().err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert error in line and line.count('m: ') <= 1
 
 
 def test_plan_refuses_override_without_machine():

@@ -24,7 +24,7 @@ from fogros2.actions.frontend.entity import (
 from fogros2.actions.nodes import CloudNode, ComposableNodeContainer, LifecycleNode, Node
 from fogros2.describe import features, keywords
 from fogros2.describe.kinds import Keyword
-from fogros2.errors import ConfigurationError, did_you_mean
+from fogros2.errors import ConfigurationError, did_you_mean, naming
 from fogros2.launch_internals.parsers import scoped
 
 #: Attributes and elements of nodes that launch_ros reads.
@@ -49,7 +49,9 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
         # the provider is resolved when the action is executed: accept the keywords of all
         parameters = {name: keyword for each in keywords.providers() if _loads(each)
                       for name, keyword in keywords.keywords(keywords.machine_class(each)).items()}
-    given = _given(entity, parser, parameters)
+    name = attribute(entity, parser, 'name')
+    with naming(name if isinstance(name, str) else ''):
+        given = _given(entity, parser, parameters)
     items = features.machine_lists()
     given.update(_items(entity, parser, items))
     what = f"a fog_machine of the provider '{provider}'" if isinstance(provider, str) else ''
