@@ -26,8 +26,9 @@ def kubeconfig_files() -> list[Path]:
 
 
 def configured() -> bool:
-    """Return whether there is a kubeconfig, or this pod may use the API."""
-    return bool(kubeconfig_files()) or (_IN_CLUSTER / 'token').is_file()
+    """Return whether a kubeconfig is named or exists, or this pod may use the API."""
+    return bool(os.environ.get('KUBECONFIG') or kubeconfig_files()) or (
+        _IN_CLUSTER / 'token').is_file()
 
 
 def load(context: str) -> tuple[str, str, Any]:
@@ -51,6 +52,10 @@ def load(context: str) -> tuple[str, str, Any]:
                 'there is no kubeconfig on this computer',
                 "set KUBECONFIG, or get one: 'aws eks update-kubeconfig', "
                 "'gcloud container clusters get-credentials', 'az aks get-credentials'")
+        if not (_IN_CLUSTER / 'token').is_file():
+            raise PrerequisiteError(
+                f"KUBECONFIG names the kubeconfig '{os.environ['KUBECONFIG']}', and there is no "
+                'such file', 'correct the path, or unset the variable')
         config.load_incluster_config()
         namespace = (_IN_CLUSTER / 'namespace').read_text().strip()
         client = kubernetes.client.ApiClient()

@@ -298,7 +298,7 @@ class Gcp(Cloud):
     creating = frozenset({'instances.insert', 'firewalls.insert'})
     order = '^POST .*/instances '
     mistakes = (
-        ('there are no Google credentials', [], {'GOOGLE_APPLICATION_CREDENTIALS': '/nowhere'}),
+        ('there is no such file', [], {'GOOGLE_APPLICATION_CREDENTIALS': '/nowhere'}),
         ('does not answer', [], {
             'CLOUDSDK_API_ENDPOINT_OVERRIDES_COMPUTE': 'http://198.51.100.1:9/'}),
         ("can't be the region", ['region:=nowhere'], {}))

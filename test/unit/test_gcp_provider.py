@@ -383,6 +383,10 @@ def test_missing_credentials_are_named(monkeypatch, tmp_path):
     assert GCPProvider.configured() is False
     with pytest.raises(PrerequisiteError, match='there are no Google credentials'):
         GCPProvider().check(SPEC)
+    monkeypatch.setenv('GOOGLE_APPLICATION_CREDENTIALS', '/kye.json')
+    assert GCPProvider.configured()  # so `ros2 fog list` reports the error
+    with pytest.raises(PrerequisiteError, match="names '/kye.json', and there is no such file"):
+        GCPProvider().check(SPEC)
 
 
 def test_running_launch_takes_a_new_login(gce, monkeypatch, tmp_path):

@@ -198,9 +198,9 @@ def test_a_context_that_is_not_there_is_named(api):
 def test_invalid_kubeconfig_is_reported(tmp_path, monkeypatch):
     path = tmp_path / 'config'
     monkeypatch.setenv('KUBECONFIG', str(path))
-    assert not kubernetes_client.configured()
+    assert kubernetes_client.configured()  # so `ros2 fog list` reports the error
     error = raised(PrerequisiteError, kubernetes_client.connect)
-    assert 'kubeconfig' in str(error)
+    assert f"KUBECONFIG names the kubeconfig '{path}', and there is no such file" in str(error)
     for text in ('', 'no: [yaml', '[]', 'contexts: 3'):
         path.write_text(text)
         assert 'kubeconfig' in str(raised(PrerequisiteError, kubernetes_client.connect))

@@ -90,7 +90,10 @@ class Account(RestAccount):
         if not login.configured():
             raise PrerequisiteError(
                 'there are no Google credentials on this computer',
-                'gcloud auth application-default login, or set GOOGLE_APPLICATION_CREDENTIALS')
+                f'gcloud auth application-default login, or set {login.VARIABLE}')
+        if not login.credentials().is_file():
+            raise PrerequisiteError(f"{login.VARIABLE} names '{login.credentials()}', and there "
+                                    'is no such file', 'correct the path, or unset the variable')
         return _login(*(os.environ.get(name, '') for name in _VARIABLES))
 
     @property
