@@ -90,8 +90,10 @@ class StatusVerb(VerbExtension):
                             'that launched it can ask its agent')
         if any('_encoder' in node['name'] or '_decoder' in node['name']
                for node in (status['agent'] or {}).get('nodes', ())):
+            from ros2fog_cli.api import progress
             from ros2fog_cli.api.watching import streams
-            status['streams'] = streams(entry.name, regions=args.region)
+            with progress.working('measuring streams'):
+                status['streams'] = streams(entry.name, regions=args.region)
         if entry.record is not None:
             try:
                 status['features'] = [row for each, own in feature.used(entry.record.spec)

@@ -41,7 +41,7 @@ from fogros2.store import (
 from fogros2_features.guests import invitation, listing, membership, program, provider
 from fogros2_testing.fakes import FakeProvider, FakeShell
 from fogros2_testing.plugins import instead
-from ros2fog_cli.api import endings, reach
+from ros2fog_cli.api import endings, progress, reach
 from ros2fog_cli.api.reach import Link
 
 OTHER = 'nLDHqcSHfnzLjlrO6PdzdSUWfvrWqPqRUQgyn6lKsjw='
@@ -199,6 +199,25 @@ def test_status_shows_guests_while_the_feature_is_installed(
     assert fog('status', 'planner', '--json') == 0
     assert 'guests' not in json.loads(capsys.readouterr().out)
     assert asked == [('look', None)] * 2
+
+
+def test_status_shows_that_it_measures_streams(
+    asked: list[tuple[str, Any]], capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def streams(name: str, **more: object) -> list[object]:
+        deadline = time.monotonic() + 60.0
+        while 'measuring streams' not in capsys.readouterr().err:
+            assert time.monotonic() < deadline
+        return []
+
+    monkeypatch.setattr(progress, 'TICK', 0.01)
+    monkeypatch.setattr(progress, 'STILL', 0.01)
+    monkeypatch.setattr('ros2fog_cli.api.watching.streams', streams)
+    monkeypatch.setattr(reach, 'agent', lambda *_: SimpleNamespace(
+        status=lambda timeout: {'nodes': [{'name': 'image_decoder'}]}, close=lambda: None))
+    monkeypatch.setattr(reach, 'link', lambda record: None)
+    assert fog('status', 'planner', '--json') == 0
 
 
 @pytest.mark.parametrize('change', [
