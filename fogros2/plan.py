@@ -88,10 +88,11 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
     if not any((index / rmw).exists() for index in indices):
         if any(has_wheels(prefix) for prefix in prefixes):
             raise DdsError(f'{rmw} is not in the wheels of ROS 2, which have {DEFAULT_RMW} alone',
-                           'unset RMW_IMPLEMENTATION, or source an installation of ROS 2')
+                           'leave out dds= and RMW_IMPLEMENTATION, or source an installation of '
+                           'ROS 2')
         if indices:
             raise DdsError(f'{rmw} is not installed on this computer',
-                           f'sudo apt-get install {apt}, or set RMW_IMPLEMENTATION to another')
+                           f'sudo apt-get install {apt}, or leave out dds= and RMW_IMPLEMENTATION')
     for spec in specs:
         own = spec.environment.get('RMW_IMPLEMENTATION') or rmw
         if own != rmw:
@@ -103,7 +104,7 @@ def check_rmw(rmw: str, prefixes: Sequence[str], specs: Iterable[MachineSpec]) -
             raise DdsError(
                 f"machine '{spec.name}' would get ROS 2 by pip, which has only {DEFAULT_RMW}, but "
                 f'nodes on the robot use {rmw}',
-                "use bootstrap='apt' (Ubuntu 24.04), or unset RMW_IMPLEMENTATION")
+                "use bootstrap='apt' (Ubuntu 24.04), or leave out dds= and RMW_IMPLEMENTATION")
 
 
 def read_domain(text: str) -> int:

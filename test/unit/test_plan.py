@@ -210,7 +210,8 @@ def test_a_middleware_has_to_be_there_and_to_be_one_for_all(tmp_path: Path) -> N
              'would get ROS 2 by pip')):
         with pytest.raises(DdsError, match=words) as caught:
             plan.check_rmw(rmw, prefixes, [spec])
-        assert caught.value.hint
+        assert 'RMW_IMPLEMENTATION' in caught.value.hint
+        assert ('dds=' in caught.value.hint) == ('hear each other' not in words)
 
 
 @pytest.mark.parametrize(('environment', 'own'), [
