@@ -50,16 +50,25 @@ def token_of(entry: Entry, shell: Shell, port: int) -> str:
                                 str(Path(addresses.folder_of(folder, port, '')))))[0]
 
 
+def no_bridge(machine: str) -> ConfigurationError:
+    """Return the error for a machine without a bridge."""
+    return ConfigurationError(
+        f"'{machine}' has no Foxglove bridge",
+        'launch_foxglove=True of the machine, or a Foxglove action, starts one')
+
+
 def credentials_of(entry: Entry, shell: Shell) -> tuple[str, str, str]:
     """
     Return the open address of the bridge (``host:port``), its token, its certificate's SHA-256.
 
-    :raises ConfigurationError: the bridge is not open to other computers.
+    :raises ConfigurationError: there is no bridge, or it is not open to other computers.
     :raises AgentError: no running launch of this robot serves the bridge, or it has no token yet.
     """
     record = entry.record
     port = 0 if record is None else addresses.port_of(record.notes)
-    if record is None or not port or not record.launch_alive or not record.agent:
+    if record is not None and record.launch_alive and not port:
+        raise no_bridge(entry.name)
+    if record is None or not record.launch_alive or not record.agent:
         raise AgentError(f"no launch of this robot serves the topics of '{entry.name}' now",
                          'ros2 fog list shows the robot of the machine')
     where = record.notes.get(addresses.NOTE_OPEN)

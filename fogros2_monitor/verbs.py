@@ -69,7 +69,6 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
     """Forward a port of this computer to the machine's bridge until Ctrl-C."""
     import contextlib
 
-    from fogros2.errors import ConfigurationError
     from fogros2.model import host_port
     from fogros2_monitor import access, addresses
     from fogros2_monitor.browser import browser_at
@@ -78,9 +77,7 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
     remote_port = addresses.PORT if entry.record is None else addresses.port_of(
         entry.record.notes)
     if not remote_port:
-        raise ConfigurationError(
-            f"'{entry.name}' has no Foxglove bridge",
-            'launch_foxglove=True of the machine, or a Foxglove action, starts one')
+        raise access.no_bridge(entry.name)
     with reach.session(entry) as shell:
         token = access.token_of(entry, shell, remote_port)
         try:

@@ -133,7 +133,8 @@ def test_monitor_address_is_shown_while_a_launch_serves_it():
 
 
 @pytest.mark.parametrize(('changes', 'kind', 'said'), [
-    ({'notes': {}}, AgentError, 'serves the topics'),
+    ({'notes': {}}, ConfigurationError, 'has no Foxglove bridge'),
+    ({'notes': {}, 'pid': 0}, AgentError, 'serves the topics'),
     ({'pid': 0}, AgentError, 'serves the topics'),
     ({'notes': {**NOTES, 'monitor_open': ''}}, ConfigurationError, 'only this robot')])
 def test_share_of_a_closed_bridge_is_refused(changes, kind, said):
