@@ -90,16 +90,18 @@ def _check_values(options: Options) -> None:
         raise ConfigurationError(
             f"'{options.user}' can't be a user name",
             'user= takes small letters, digits, - and _, beginning with a letter')
-    for name in ('image', 'network', 'memory', 'gpus'):
+    for name in ('image', 'network', 'memory'):
         word = getattr(options, name)
         # The engine would parse it as an option.
         if word.startswith('-') or any(c.isspace() for c in word):
             raise ConfigurationError(f"option '{name}' can't be '{word}'",
                                      'it is one word, and none that begins with a hyphen')
-    if options.memory and not re.fullmatch(r'(?i)[0-9]+([.][0-9]+)?([bkmg]|[kmg]b)?',
+    if options.memory and not re.fullmatch(r'(?i)[0-9]+([.][0-9]+)?([bkmg]|[kmg]b)|[0-9]{7,}',
                                            options.memory):
         raise ConfigurationError(f"'{options.memory}' is no amount of memory",
                                  "memory= takes '2g' or '512m'")
+    if options.gpus and not re.fullmatch('all|[0-9]+', options.gpus):
+        raise ConfigurationError(f"gpus= can't be '{options.gpus}'", "it takes 'all' or a number")
     for port in options.ports:
         _check_port(port)
     for device in options.devices:
@@ -108,7 +110,7 @@ def _check_values(options: Options) -> None:
                                      "devices= takes such as '/dev/video0'")
     for mount in options.mounts:
         source = mount.split(':')[0]
-        if mount.count(':') > 1 or not os.path.isabs(source) or '/..' in mount:
+        if mount.count(':') > 1 or '/..' in mount or not all(map(os.path.isabs, mount.split(':'))):
             raise ConfigurationError(f"mounts= can't hold '{mount}'",
                                      "it takes '/path' or '/path:/path there'")
         if not os.path.exists(source):
