@@ -28,7 +28,7 @@ class VolumeVerb(VerbExtension):
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
-        parser.add_argument('action', choices=('list', 'delete'), help=(
+        parser.add_argument('action', choices=('list', 'delete'), metavar='list | delete', help=(
             'of all providers that are set up; of Kubernetes the current context, of Google '
             'Cloud the project of your credentials'))
         _add_options(parser)
@@ -45,8 +45,9 @@ class VolumeVerb(VerbExtension):
         from ros2fog_cli.api import machines
         names = parse_late(args, args.rest, 'volume', _add_options)
         if (args.action == 'delete') != bool(names):
-            raise ConfigurationError("'ros2 fog volume list' takes no names, 'delete' some",
-                                     'ros2 fog volume list shows them')
+            takes = 'names or ids of volumes' if args.action == 'delete' else 'no names'
+            raise ConfigurationError(f"'ros2 fog volume {args.action}' takes {takes}",
+                                     'ros2 fog volume list shows all')
         volumes = listing.survey(warn, regions=args.region, hosts=args.host)
         if args.action == 'delete':
             return delete_each([

@@ -35,9 +35,11 @@ class DeleteVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Delete the machines; return 1 if something still exists."""
-        from fogros2.store import Store
+        from fogros2.store import check_name, Store
         from ros2fog_cli.api import endings, machines, progress
         store = Store()
+        for name in args.name:
+            check_name(name)
         names = [None] if 'all' in args.name else list(dict.fromkeys(args.name))
         every = machines.survey(warn, name=names[0] if len(names) == 1 else None,
                                 regions=args.region, store=store)

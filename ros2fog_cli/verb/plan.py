@@ -14,7 +14,7 @@ class PlanVerb(VerbExtension):
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add the verb's arguments."""
         parser.add_argument('file', help='path of the launch file')
-        parser.add_argument('launch_arguments', nargs='*', metavar='NAME:=VALUE',
+        parser.add_argument('launch_arguments', nargs='*', default=[], metavar='NAME:=VALUE',
                             help='arguments of the launch file')
         add_overrides(parser)
 

@@ -850,6 +850,21 @@ def test_region_swallows_no_name(words: Sequence[str], capfd: pytest.CaptureFixt
     assert 'arguments are required' not in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(('words', 'said'), [
+    (('plan',), 'required: file\n'), (('volume',), 'required: list | delete, '),
+    (('volume', 'delete'), "'ros2 fog volume delete' takes names or ids"),
+    (('volume', 'list', 'maps'), "'ros2 fog volume list' takes no names"),
+    (('delete', 'first,second'), "'first,second' is no name for a machine")])
+def test_missing_or_wrong_word_is_named(
+    words: Sequence[str], said: str, capfd: pytest.CaptureFixture[str],
+) -> None:
+    try:
+        result = str(run(*words))
+    except SystemExit:
+        result = ''
+    assert said in result + capfd.readouterr().err
+
+
 @pytest.mark.parametrize('verb', [('list',), ('status', 'slam')])
 def test_unknown_region_gets_the_nearest(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], verb: Sequence[str],
