@@ -94,7 +94,8 @@ def check_program(program: str, path: str, cwd: str) -> None:
     for each in candidates:
         if os.path.exists(each):
             raise Refused(f"'{each}' isn't executable on the machine")
-    raise Refused(f"'{program}' not found on the machine")
+    raise Refused(f"'{program}' not found on the machine",
+                  '' if '/' in program else 'the executable of a package needs package=')
 
 
 def interpreter(command: list[str]) -> list[str]:

@@ -85,6 +85,16 @@ def test_package_with_a_broken_link_gets_no_suggestion(prefix: str, tmp_path: Pa
     assert caught.value.answer['hint'] == 'is its workspace the one that travels?'
 
 
+@pytest.mark.parametrize(('program', 'hint'), [
+    ('talker', 'the executable of a package needs package='), ('./talker', '')])
+def test_program_without_a_package_names_the_keyword(
+    program: str, hint: str, tmp_path: Path,
+) -> None:
+    with pytest.raises(Refused) as caught:
+        programs.check_program(program, '/bin', str(tmp_path))
+    assert caught.value.answer.get('hint', '') == hint
+
+
 def test_first_prefix_with_a_package_wins(prefix: str, tmp_path: Path) -> None:
     overlay = tmp_path / 'overlay'
     (overlay / programs.INDEX).mkdir(parents=True)
