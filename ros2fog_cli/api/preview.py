@@ -26,7 +26,7 @@ from launch.substitutions import Command, SubstitutionFailure
 
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
-from fogros2.deploy.checks import check_here
+from fogros2.deploy.checks import check_here, check_names
 from fogros2.deploy.choosing import Choices
 from fogros2.describe import defaults, values
 from fogros2.describe.keywords import ROBOT
@@ -226,7 +226,10 @@ class Preview:
             if spec.provider == ROBOT:
                 self._on_robot.add(spec.name)
                 return ROBOT
-            self._planned(spec.name).spec = spec
+            planned = self._planned(spec.name)
+            if planned.spec is not None and planned.spec != spec:
+                check_names([planned.spec, spec])
+            planned.spec = spec
             return spec.name
         except _UNKNOWN as error:
             return self._refused(machine.name, f'{machine.provider}: ', error)

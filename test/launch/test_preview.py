@@ -268,6 +268,13 @@ def test_plan_refuses_what_a_launch_refuses(tmp_path, capsys, body, error):
     assert error in line and line.count('m: ') <= 1
 
 
+def test_plan_refuses_two_machines_of_one_name():
+    plan = Preview(LaunchDescription([
+        node(ContainerInstance(name='a')), node(AWSCloudInstance(name='a'))]), {})
+    (machine,) = plan.machines
+    assert "two machines of this launch have the name 'a'" in str(machine.error)
+
+
 def test_plan_refuses_override_without_machine():
     described = [node(ContainerInstance(name='first'))]
     with pytest.raises(ConfigurationError, match="no machine of this name.*mean 'first'"):
