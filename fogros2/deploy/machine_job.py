@@ -68,6 +68,8 @@ class MachineJob(Site):
         self.claimed = time.monotonic()
         #: Seconds of silence after which it is lost, whatever its provider reports.
         self.longest_silence: Optional[float] = None
+        #: Whether its agent has announced the end of the nodes: silence is no news then.
+        self.announced = False
         #: The agent's UDP port for heartbeats, and the address from which they come.
         self.heartbeats = (plan.HEARTBEAT_PORT, context.vpn.interface.address)
         #: Number of the first agent event that belongs to this launch; 0 before the agent answers.

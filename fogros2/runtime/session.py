@@ -440,6 +440,8 @@ class Session:
         if kind in _NOTICES:
             level, text = _NOTICES[kind]
             self._logger.log(level, f'{self.spec.name}: {text.format_map(event)}')
+        if kind == 'watchdog' and self.running is not None:
+            self.running.announced = True
         if kind == 'gap' and not self._comparing:
             self._comparing = True
             self.request(self._compare)

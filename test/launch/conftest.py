@@ -35,6 +35,7 @@ class FakeMachine:
         self.all = []
         self.stops = []
         self.signals = []
+        self.announced = False
         self.exits_on_stop = True
         #: Why the machine is gone, '' while it is there.
         self.lost = ''

@@ -660,6 +660,7 @@ def test_events_of_the_agent_are_logged(run, fake, planner, capfd):
 
     fake.on_start = says
     assert run(LaunchDescription([talker(planner)])) == 0
+    assert fake.machines['planner'].announced
     output = capfd.readouterr().out
     for line in (
             '[ERROR] [fogros2]: planner: the agent ends everything: lifetime',

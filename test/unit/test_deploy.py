@@ -61,7 +61,7 @@ from fogros2.model import (
     Peer,
     Result,
 )
-from fogros2.report import StepDone, StepFailed
+from fogros2.report import Silence, StepDone, StepFailed
 from fogros2.shell import host_key
 from fogros2.store import Made, process_start, Store
 from fogros2.vpn import addresses, STAYS
@@ -977,6 +977,17 @@ def test_failing_watch_is_reported_and_becomes_a_fault(launch, provider, monkeyp
     with pytest.raises(KeyError):
         watch.close()
     watch.close()
+
+
+@pytest.mark.parametrize('announced', [False, True])
+def test_silence_after_the_announced_end_is_not_reported(
+        launch, provider, monkeypatch, announced):
+    heard = []
+    context, mine = begun(launch, report=heard.append)
+    mine.heartbeat, mine.announced = SimpleNamespace(age=10.0), announced
+    monkeypatch.setattr(watching, 'Periodic', lambda *words, **named: None)
+    Watch(context, mine, over=print, found=print)._look()
+    assert [isinstance(event, Silence) for event in heard] == [True] * (not announced)
 
 
 class Cut:

@@ -152,7 +152,7 @@ class Watch(Step):
     def _look(self) -> None:
         age = self._job.heartbeat.age or 0.0
         due = self._alarm.due(age, time.monotonic())
-        if due is not None:
+        if due is not None and not self._job.announced:
             self._context.report(Silence(self._job.name, *due))
         if (limit := self._job.longest_silence) is not None:
             if age > limit:
