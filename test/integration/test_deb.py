@@ -33,6 +33,7 @@ from fogros2.model import Command, Result
 from fogros2.plugin_system import own_packages
 from fogros2.process import run, which
 from fogros2.provider.container import debian_root
+from fogros2.vpn.helped import PROTOCOL
 from rigs.cluster.images import RootShell
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -397,7 +398,7 @@ def test_what_goes_to_a_machine_has_the_nodes_in_it(installed: System) -> None:
 def test_group_member_may_create_vpn_interfaces(installed: System) -> None:
     helper = '/usr/libexec/fogros2/vpn'
     assert 'fogros2:' in installed.run('getent', 'group', 'fogros2').stdout
-    assert installed.run('sh', '-c', f'echo "{{}}" | {helper} check').stdout == '4\n'
+    assert installed.run('sh', '-c', f'echo "{{}}" | {helper} check').stdout == f'{PROTOCOL}\n'
     assert 'by sudo' in installed.run(helper, 'check', user='nobody', check=False).stderr
     assert installed.run('stat', '-c', '%a %u', '/etc/sudoers.d/fogros2-vpn').stdout == '440 0\n'
 

@@ -24,6 +24,7 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command, Result
+from fogros2.vpn.helped import PROTOCOL
 from fogros2.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -158,7 +159,7 @@ def peer(address: str, key: str = KEY) -> dict[str, object]:
 
 
 def test_a_user_makes_changes_and_takes_away_an_interface(copy: Copy) -> None:
-    assert copy.ask('fogada', 'check').stdout == '4\n'
+    assert copy.ask('fogada', 'check').stdout == f'{PROTOCOL}\n'
     with interface(copy, 'fogada', NAME, '198.18.7.0/24', 51820) as key:
         assert re.fullmatch('[A-Za-z0-9+/]{43}=', key)
         assert NAME in copy.links()
@@ -420,4 +421,4 @@ def test_it_is_removed_without_a_trace(copy: Copy) -> None:
             assert copy.run('root', 'test', '-e', path).returncode == 1, path
         assert copy.run('root', 'getent', 'group', 'fogros2').returncode != 0
         copy.run('root', install, 'fogada', 'fogbob', check=True)
-    assert copy.ask('fogada', 'check').stdout == '4\n'
+    assert copy.ask('fogada', 'check').stdout == f'{PROTOCOL}\n'

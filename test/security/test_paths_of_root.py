@@ -16,7 +16,7 @@ PACKAGE = Path(fogros2.__file__).parent
 LIST = re.compile(r'^\s*(?:for \w+ in|set --) ([^;\n]*)', re.MULTILINE)
 QUOTED = re.compile('"[^"]*"')
 #: Texts with no path in them, and a list whose parts a colon ends.
-NO_PATHS = ('$(cat "$1/cgroup.procs")', '$({_FROM})', '$AMENT_PREFIX_PATH')
+NO_PATHS = ('$(cat "$1/cgroup.procs")', '$({_FROM})', '$AMENT_PREFIX_PATH', '$(stat -c %u ')
 
 
 def test_no_script_splits_a_list_of_paths_at_blanks() -> None:
