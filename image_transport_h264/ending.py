@@ -11,9 +11,14 @@ without timers may wait again, until it is killed.
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
+import ctypes
+import functools
+import math
 import os
 import signal
 import threading
+import time
 from typing import Optional, TypeVar
 
 import rclpy
@@ -27,6 +32,15 @@ Made = TypeVar('Made', bound=Node)
 _SIGNALS = signal.SIGINT, signal.SIGTERM
 #: Seconds that a signal waits for a node that is being made.
 LONGEST = 5.0
+#: Seconds for the end of a node. Launch kills a process after 10.
+TOO_LONG = 8.0
+
+
+class _Event(ctypes.Structure):
+    """POSIX's ``sigevent``, which calls a function of C in a new thread."""
+
+    _fields_ = [('value', ctypes.c_void_p), ('number', ctypes.c_int), ('notify', ctypes.c_int),
+                ('function', ctypes.c_void_p), ('rest', ctypes.c_byte * 40)]
 
 
 def run(
@@ -60,8 +74,37 @@ def run(
             raise
     finally:
         if node is not None:
+            _exit_after(TOO_LONG)
             node.destroy_node()
+            _exit_after(math.inf)
     return node
+
+
+@functools.cache
+def _timer() -> Callable[[float], object]:
+    """Return what sets the seconds until this process exits with status 0."""
+    library, timer = ctypes.CDLL(None), ctypes.c_void_p()
+    event = _Event(0, 0, 2, ctypes.cast(library._exit, ctypes.c_void_p))  # SIGEV_THREAD
+    library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer))
+
+    def set_to(seconds: float) -> object:
+        after = 0.0 if math.isinf(seconds) else seconds
+        times = (ctypes.c_long * 4)(0, 0, int(after), int(after % 1 * 1e9))
+        return library.timer_settime(timer, 0, times, None)
+
+    return set_to
+
+
+def _exit_after(seconds: float) -> None:
+    """
+    Exit with status 0 after a time, infinite for never, without Python.
+
+    A node of ROS 2's wheels may hang while it is destroyed, and holds Python's lock meanwhile: if
+    another participant ends at that moment, Fast DDS waits for a callback without a limit. Built
+    for an older C library, this wait gets an invalid time and keeps the lock of the callback.
+    """
+    with contextlib.suppress(AttributeError):  # glibc before 2.34 has no timers in its main part
+        _timer()(seconds)
 
 
 def _init() -> threading.Event:

@@ -43,3 +43,35 @@ def test_idle_node_ends_at_any_moment(bench: Bench, number: signal.Signals) -> N
             finally:
                 node.kill()
         assert (node.returncode, errors) == (0, ''), f'signal after {moment:.4f} s'
+
+
+#: A node that hangs in C while it is destroyed, with the interpreter's lock.
+HANGING = """
+import ctypes
+import sys
+from rclpy.node import Node
+from image_transport_h264 import ending
+class Hanging(Node):
+    def destroy_node(self):
+        if 'hang' in sys.argv:
+            ctypes.PyDLL(None).sleep(60)
+        super().destroy_node()
+ending.TOO_LONG = 0.5
+ending.run(lambda: print('made', flush=True) or Hanging('hanging'))
+print('ended')
+if 'hang' not in sys.argv:
+    ending.threading.Event().wait(1.0)
+"""
+
+
+@pytest.mark.parametrize('word, said', [('hang', ''), ('end', 'ended\n')])
+def test_node_that_hangs_in_its_end_exits(bench: Bench, word: str, said: str) -> None:
+    with subprocess.Popen([sys.executable, '-c', HANGING, word], env=bench.environment, text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as node:
+        try:
+            assert node.stdout is not None and node.stdout.readline() == 'made\n'
+            node.send_signal(signal.SIGINT)
+            output = node.communicate(timeout=50)
+        finally:
+            node.kill()
+    assert (node.returncode, *output) == (0, said, '')
