@@ -14,7 +14,6 @@ from collections.abc import Callable
 import contextlib
 import ctypes
 import functools
-import math
 import os
 import signal
 import threading
@@ -32,8 +31,8 @@ Made = TypeVar('Made', bound=Node)
 _SIGNALS = signal.SIGINT, signal.SIGTERM
 #: Seconds that a signal waits for a node that is being made.
 LONGEST = 5.0
-#: Seconds for the end of a node. Launch kills a process after 10.
-TOO_LONG = 8.0
+#: Seconds for the end of the middleware's part of a node.
+TOO_LONG = 4.0
 
 
 class _Event(ctypes.Structure):
@@ -74,9 +73,10 @@ def run(
             raise
     finally:
         if node is not None:
-            _exit_after(TOO_LONG)
-            node.destroy_node()
-            _exit_after(math.inf)
+            with node.handle:  # the middleware's part ends with this block
+                node.destroy_node()
+                _exit_after(TOO_LONG)
+            _exit_after(0.0)
     return node
 
 
@@ -88,8 +88,7 @@ def _timer() -> Callable[[float], object]:
     library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer))
 
     def set_to(seconds: float) -> object:
-        after = 0.0 if math.isinf(seconds) else seconds
-        times = (ctypes.c_long * 4)(0, 0, int(after), int(after % 1 * 1e9))
+        times = (ctypes.c_long * 4)(0, 0, int(seconds), int(seconds % 1 * 1e9))
         return library.timer_settime(timer, 0, times, None)
 
     return set_to
@@ -97,7 +96,7 @@ def _timer() -> Callable[[float], object]:
 
 def _exit_after(seconds: float) -> None:
     """
-    Exit with status 0 after a time, infinite for never, without Python.
+    Exit with status 0 after a time, 0 for never, without Python.
 
     A node of ROS 2's wheels may hang while it is destroyed, and holds Python's lock meanwhile: if
     another participant ends at that moment, Fast DDS waits for a callback without a limit. Built
