@@ -14,7 +14,7 @@ from fogros2 import feature, model, plan
 from fogros2.agent.loop import boot_clock
 from fogros2.errors import FogError
 from fogros2.feature import Cost
-from fogros2.model import MachineSpec
+from fogros2.model import Machine, MachineSpec
 from fogros2.provider import Provider
 from fogros2.report import Reporter, step
 
@@ -32,6 +32,8 @@ class Choices:
         self._lock = threading.Lock()
         self._resolved: dict[str, MachineSpec] = {}
         self._places: dict[str, list[MachineSpec]] = {}
+        #: By id, machines of earlier launches that were found to run; whoever adopts one takes it.
+        self.running: dict[str, Machine] = {}
         #: Of each machine that exists or will be created, with ``_clocks`` when it began,
         #: and of those that have ended.
         self._costs: dict[str, tuple[Cost, Optional[tuple[float, float]]]] = {}

@@ -199,8 +199,10 @@ class Launch:
         """Return whether the machine of a record with its id has not expired meanwhile."""
         assert before.machine_id is not None
         with contextlib.suppress(MachineNotFound):
-            return self.provider(before.provider).describe(
-                before.machine_id).state is not MachineState.DELETED
+            machine = self.provider(before.provider).describe(before.machine_id)
+            if machine.state is MachineState.RUNNING:
+                self._choices.running[machine.id] = machine
+            return machine.state is not MachineState.DELETED
         return False
 
     def provider(self, name: str) -> Provider:

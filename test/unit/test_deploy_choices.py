@@ -252,6 +252,8 @@ def test_kept_machine_fits_though_today_differs(
     again.prepare([SPEC])
     mine = create(again)
     assert mine.life.phase == 'kept' and not {'resolve', 'create'} & {*provider.calls}
+    # an engine takes 0.1 s for an answer
+    assert provider.calls.count('describe') == 1
     assert mine.spec.options == {'size': 'small'}
     assert [(one.spec.name, one.price) for one in again.costs()] == [('planner', Decimal('0.5'))]
     mine.enter('up')

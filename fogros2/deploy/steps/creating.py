@@ -101,7 +101,8 @@ class Creation(Step):
         # a launch that was killed did not save the id of its machine, if it has one
         if before.machine_id is not None:
             with contextlib.suppress(MachineNotFound):
-                machine = provider.describe(before.machine_id)
+                machine = context.choices.running.pop(before.machine_id, None) \
+                    or provider.describe(before.machine_id)
         if machine is None or machine.state is MachineState.DELETED or (
                 own and before.spec.on_exit == 'delete'):
             # what was made for it may still be there
