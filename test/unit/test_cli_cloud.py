@@ -851,7 +851,7 @@ def test_region_swallows_no_name(words: Sequence[str], capfd: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(('words', 'said'), [
-    (('plan',), 'required: file\n'), (('volume',), 'required: list | delete, '),
+    (('plan',), 'required: file\n'), (('volume',), 'required: list | delete'),
     (('volume', 'delete'), "'ros2 fog volume delete' takes names or ids"),
     (('volume', 'list', 'maps'), "'ros2 fog volume list' takes no names"),
     (('delete', 'first,second'), "'first,second' is no name for a machine")])
