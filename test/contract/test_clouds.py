@@ -254,3 +254,12 @@ def test_leftovers_of_a_dead_launch_go_at_once(memory):
     (said,) = memory.provider().tidy([token])
     assert 'planner' in said
     gone(memory)
+
+
+def test_machine_detaches_no_volume_of_another(memory):
+    """Such as a kept one, whose launch found the volume in use."""
+    one, _ = with_volume(memory, 'one')
+    two, _ = create(memory, 'two')
+    keeper = volume_keeper(memory.provider())
+    keeper.detach(two, 'models')
+    assert [volume.user in one for volume in keeper.volumes()] == [True]

@@ -307,3 +307,37 @@ def test_invalid_settings_are_refused(settings):
 def test_settings_of_a_newer_robot_are_ignored():
     assert checked({'new': 1, 'id': 3, 'machine': 'x', 'heartbeat': HEARTBEAT}) == {
         'machine': 'x', 'heartbeat': HEARTBEAT}
+
+
+def test_end_of_the_machine_is_tried_until_it_ends(tmp_path, monkeypatch):
+    """Such as by a cloud's API that does not answer at first: else it runs and costs on."""
+    agent = Agent({'directory': str(tmp_path / 'agent'), 'end_command': ['end-me']})
+    ran, later = [], []
+    monkeypatch.setattr(agent.processes, 'spawn', lambda argv, then, **_: (
+        ran.append(argv), then(1)))
+    monkeypatch.setattr(agent.loop, 'at', lambda seconds, call: later.append((seconds, call)))
+    monkeypatch.setattr(agent, 'emit', lambda event: None)
+    agent._end_machine()
+    for _ in range(3):
+        (seconds, again), = later
+        later.clear()
+        assert seconds <= 60.0
+        again()
+    assert ran == 4 * [['end-me']]
+
+
+@pytest.mark.parametrize(('adopted', 'action'), [
+    (False, 'end the machine'), (True, 'stop the nodes')])
+def test_machine_whose_first_launch_died_is_not_kept(tmp_path, monkeypatch, adopted, action):
+    """It may not even be complete; one that a later launch took over is."""
+    agent = Agent({'directory': str(tmp_path / 'agent'), 'on_exit': 'keep', 'boot_timeout': 60.0,
+                   'end_command': ['end-me']})
+    agent.adopted, events = adopted, []
+    monkeypatch.setattr(agent, 'emit', events.append)
+    monkeypatch.setattr(agent.nodes, 'stop_all', lambda then: None)
+    agent._watch()
+    assert events == []
+    agent.watchdog.boot_from -= 61.0
+    agent._watch()
+    assert events == [{'event': 'watchdog', 'reason': 'no launch came', 'action': action}]
+    assert agent.ending != adopted

@@ -876,3 +876,14 @@ def test_list_loads_no_cloud_that_is_not_set_up(tmp_path: Path) -> None:
                               name: os.environ[name] for name in ('PYTHONPATH', 'LD_LIBRARY_PATH')
                               if name in os.environ}})
     assert done.stdout == 'no machines\n[]\n'
+
+
+def test_record_stays_until_the_vpn_interface_is_gone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    machine('a')
+    record('a', **dead())
+    monkeypatch.setattr(endings, 'clear', Mock(side_effect=[ProviderError('sudo refuses'), None]))
+    assert run('delete', 'a', '--yes') == 1 and 'sudo refuses' in capsys.readouterr().err
+    assert Store().exists('a')
+    assert run('delete', 'a', '--yes') == 0 and not Store().exists('a')

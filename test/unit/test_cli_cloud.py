@@ -934,3 +934,11 @@ def test_token_that_takes_long_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> 
     entry = Entry('slam', 'cloud', machine('slam'), record('slam', launch='abc123', agent='/run'))
     with pytest.raises(DeadlineExceeded, match='ros2 fog status slam'):
         access.token_of(entry, Slow(), 8765)
+
+
+def test_port_of_a_launch_that_begins_meanwhile_stays_open(shells: list[Endpoint]) -> None:
+    machine('slam')
+    record('slam')
+    with reach.session(reach.find('slam', pytest.fail)):
+        record('slam', alive=True)
+    assert [call[0] for call in Cloud.asked if call[0] != 'find'] == ['allow', 'connect']

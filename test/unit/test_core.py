@@ -11,8 +11,9 @@ import time
 import pytest
 
 from fogros2 import errors, model, plugin_system, process, report
+from fogros2.errors import Cancelled
 from fogros2.model import Command, NodeSpec, Result
-from fogros2.waiting import wait_until
+from fogros2.waiting import cancellable, wait_until
 from fogros2_testing.plugins import install
 
 
@@ -140,3 +141,24 @@ def test_command_finds_programs_in_an_empty_environment(monkeypatch):
     for name in list(os.environ):
         monkeypatch.delenv(name)
     assert run('sh', '-c', 'ls / >/dev/null; echo fine').stdout == 'fine\n'
+
+
+def test_late_result_of_an_abandoned_call_is_passed_on():
+    """Such as a connection, which somebody has to close."""
+    answered, cancel, late = threading.Event(), threading.Event(), []
+
+    def call():
+        cancel.set()
+        answered.wait(60)
+        return 'a connection'
+
+    with pytest.raises(Cancelled):
+        cancellable(call, cancel, what='connecting', grace=lambda: 0.0, late=late.append)
+    assert late == []
+    answered.set()
+    wait_until(lambda: late or None, timeout=60, what='the result')
+    assert late == ['a connection']
+
+
+def test_wait_without_time_looks_once():
+    assert wait_until(lambda: 5, timeout=0.0, what='the number') == 5

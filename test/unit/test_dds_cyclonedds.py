@@ -319,3 +319,11 @@ def test_a_path_that_cyclone_would_split_is_refused() -> None:
 def test_discovery_that_is_off_is_refused() -> None:
     with pytest.raises(DdsError, match='ROS_AUTOMATIC_DISCOVERY_RANGE'):
         CYCLONE.environment('/state/dds.xml', {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'off'})
+
+
+def test_robot_with_peers_reaches_them_through_routers() -> None:
+    """``DontRoute`` would keep it from computers outside of its LAN."""
+    user = {'ROS_STATIC_PEERS': '192.0.2.7'}
+    interfaces = CYCLONE.robot_interfaces('foga1b2c3', 'eth0', user)
+    assert max(interfaces, key=lambda one: one.priority).name == 'eth0'
+    assert texts(rendered(*interfaces), 'DontRoute') == []

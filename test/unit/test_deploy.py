@@ -1261,3 +1261,18 @@ def test_a_machine_is_ended_while_another_still_comes_up(launch):
     assert launch.down() == []
     thread.join(60)
     assert isinstance(slow.exception(), Cancelled)
+
+
+def test_vpn_goes_down_though_its_agent_fails(launch, provider):
+    def refuse(*words, **named):
+        raise AgentError('the agent is broken')
+
+    context, mine = begun(launch, dataclasses.replace(SPEC, on_exit='keep'))
+    Joining(context, mine).choose_interface()
+    mine.enter('up')
+    mine.agent = SimpleNamespace(request=refuse)
+    mine.shell = FakeShell(handlers={'true': lambda c: Result(0, '', '')})
+    with mine.undo:
+        mine.push(undo.VPN)
+    assert [str(failure) for failure in context.failures] == ['the agent is broken']
+    assert [command.argv for command in mine.shell.commands] == [('true',)]

@@ -16,7 +16,13 @@ from fogros2.deploy.context import Context
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.steps import creating
 from fogros2.deploy.steps.creating import Creation
-from fogros2.errors import AgentError, ConfigurationError, ProviderError, WorkspaceError
+from fogros2.errors import (
+    AgentError,
+    ConfigurationError,
+    NameTaken,
+    ProviderError,
+    WorkspaceError,
+)
 from fogros2.feature import Cost
 from fogros2.model import MachineSpec
 from fogros2.report import StepDone, StepFailed, StepStarted, Warned
@@ -342,3 +348,23 @@ def test_image_of_a_kept_machine_has_what_was_added(launch, provider, tmp_path, 
     create(Launch(store=Store(tmp_path), environment={}),
            dataclasses.replace(SPEC, apt=('libzbar0',)))
     assert [tags['fogros2-dependencies'] for tags in adopted] == ['libzbar0']
+
+
+def test_stopped_machine_costs_nothing_any_more(launch, provider, monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(choosing, '_clocks', lambda: (now, now))
+    mine = create(launch, dataclasses.replace(SPEC, on_exit='stop'))
+    mine.enter('up')
+    now += 60
+    mine.undo.close()
+    now += 60
+    assert launch.costs() == [Cost(mine.spec, Decimal('0.5'), 60.0, ended=True)]
+
+
+def test_machine_that_does_not_come_up_takes_no_budget(launch, provider):
+    launch.prepare([SPEC])
+    assert [cost.price for cost in launch.costs()] == [Decimal('0.5')]
+    with launch.store.lock('planner', cancel=launch.cancel):
+        with pytest.raises(NameTaken):
+            launch.up(SPEC)
+    assert launch.costs() == []

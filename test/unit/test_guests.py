@@ -257,3 +257,16 @@ def test_machine_that_this_computer_has_left_refuses_commands(
                        name='planner')
     with pytest.raises(AuthenticationError, match="has left 'planner'"):
         shell.run(Command(('true',)), timeout=10.0)
+
+
+def test_guest_that_leaves_is_no_peer_after_a_repair(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Its eviction failed; the repair of an interface asks for its peers."""
+    monkeypatch.setenv('PATH', os.environ['PATH'])  # which the program extends
+    machine.stuck = {'fogabc123m0g224': OSError('no memory')}
+    with pytest.raises(OSError, match='is not deleted yet'):
+        machine.change('remove', keys=[KEY])
+    guests.main('fogabc123m0', 'peers', machine.guests.state.parent)
+    peers = capsys.readouterr().out
+    assert f'PublicKey = {OTHER}\n' in peers and KEY not in peers

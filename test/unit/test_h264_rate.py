@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip('av', reason='PyAV (the extra "video") is not installed')
 from image_transport_h264.codec import Settings
 from image_transport_h264.control import Control
+from image_transport_h264.rate import Governor, LEAST_BITS
 
 PIXELS = 160 * 120
 #: Bits of a picture: most, as a VGA scene has, and least.
@@ -206,3 +207,29 @@ def test_bitrate_of_the_user_is_the_ceiling() -> None:
     assert control.settings(Settings(), 1.0).bitrate == 500_000
     with pytest.raises(ValueError, match='max_rate'):
         control.ask(Settings(), -1.0, True)
+
+
+def test_share_of_a_link_limits_bitrate_and_pictures() -> None:
+    control = Control(Settings(bitrate=8_000_000))
+    control.share = 1e6
+    assert control.settings(Settings(bitrate=8_000_000), 100.0).bitrate == 1_000_000
+    # a share below what a picture needs at the least: fewer pictures
+    control.share = 0.5 * LEAST_BITS * PIXELS * 30
+    sent = 0
+    for number in range(300):
+        if control.due(100 + number / 30, PIXELS):
+            control.sent(number, 100, 100 + number / 30)
+            sent += 1
+    assert 150 <= sent <= 200
+
+
+def test_time_on_the_wire_is_no_queue() -> None:
+    """A large picture takes its time on a slow link, also where none waits."""
+    governor, now = Governor(1_000_000), 0.0
+    for number in range(200):
+        # a still scene, then motion
+        bits = 400 if number < 20 else 45_000
+        governor.sent(number, bits // 8, now)
+        governor.acknowledged(number, 0, now + 0.005 + bits / 1e6)
+        now += 0.05
+    assert governor.bitrate == 1_000_000

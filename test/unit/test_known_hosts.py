@@ -150,3 +150,9 @@ def test_damaged_certificate_is_refused(keys, tmp_path, change):
 def test_certificate_with_a_sha_1_signature_is_refused(keys, tmp_path):
     blob = certificate(keys, tmp_path, '-h', '-t', 'ssh-rsa', authority='rsa')
     assert fault(keys, blob, authorities=(keys[1]['rsa'],)) == 'has a wrong signature'
+
+
+def test_certificate_with_an_unknown_critical_option_is_refused(keys, tmp_path):
+    """OpenSSH defines none for hosts, and refuses those that it does not know."""
+    blob = certificate(keys, tmp_path, '-h', '-O', 'critical:only-on@example.com=monday')
+    assert fault(keys, blob) == 'is not for hosts'

@@ -338,3 +338,10 @@ def test_type_is_not_chosen_without_the_feature(monkeypatch: pytest.MonkeyPatch)
     spec = MachineSpec('planner', 'aws', {'region': REGION, 'min_cpu': 8})
     with pytest.raises(ConfigurationError, match="there is no feature 'prices'"):
         AWSProvider().resolve(spec)
+
+
+def test_price_limit_admits_the_price_itself(market: Market) -> None:
+    for limit, spot in (('0.048', False), ('0.0151', True)):
+        market.check(REGION, 't3.medium', VmOptions(spot=spot, max_price=Decimal(limit)))
+    with pytest.raises(ConfigurationError, match='more than max_price=0.0479'):
+        market.check(REGION, 't3.medium', VmOptions(max_price=Decimal('0.0479')))

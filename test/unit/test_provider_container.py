@@ -677,3 +677,11 @@ def test_folder_of_a_killed_creation_goes(monkeypatch, tmp_path):
     # of a launch that is known to have died
     assert provider.tidy(['fresh', 'with-container']) == [f"the folder {tops['fresh']}"]
     assert [top.exists() for top in tops.values()] == [True, False, False]
+
+
+def test_folder_of_mounts_is_read_only(tmp_path):
+    options = Options.parse({'mounts': [str(tmp_path), f'{tmp_path}:/data']})
+    words = [*container_options.common_flags(
+        Engine('podman'), MachineSpec('m', 'container'), REQUEST, options)]
+    assert [word for word in words if word.startswith(str(tmp_path))] == [
+        f'{tmp_path}:{tmp_path}:ro', f'{tmp_path}:/data:ro']

@@ -6,9 +6,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import random
+from types import SimpleNamespace
 
 import pytest
 
+from fogros2.model import MachineSpec, NodeSpec
+from fogros2_features.replacement.options import Options
+from fogros2_features.replacement.replacer import GRACE, Replacer
 from fogros2_features.replacement.steps import decide, Replacement
 
 UP = Replacement(limit=2, drain=20.0, fence=140.0)
@@ -100,3 +104,31 @@ def test_nodes_never_move_unfenced():
                 assert event == 'ended' and state.moved
             if 'come_back' in commands:
                 silent = None
+
+
+def test_fence_outlasts_the_watchdog_and_the_slowest_node():
+    """A machine without heartbeats stops its nodes after ``robot_timeout``, which take time."""
+    session = SimpleNamespace(own=Options(max_replacements=2), checkpoints=None,
+                              spec=MachineSpec('planner', 'aws', robot_timeout=120.0))
+    replacer = Replacer(session, None, None, in_thread=None, is_over=lambda: False, logger=None)
+    assert (replacer.state.drain, replacer.state.fence) == (GRACE, 120.0 + GRACE)
+    for seconds in (40.0, 1.0):
+        replacer.allow(NodeSpec(
+            id='1', name='mapper', sigterm_timeout=seconds, sigkill_timeout=20.0))
+        assert (replacer.state.drain, replacer.state.fence) == (60.0 + GRACE, 180.0 + GRACE)
+
+
+def test_ending_launch_replaces_nothing():
+    """It deletes no machine that it keeps, and creates none."""
+    asked, over = [], []
+    session = SimpleNamespace(own=Options(max_replacements=2), checkpoints=None,
+                              spec=MachineSpec('planner', 'aws'), request=asked.append)
+    loop = SimpleNamespace(time=lambda: 0.0, call_at=lambda *_: None)
+    replacer = Replacer(
+        session, None, loop, in_thread=None, is_over=lambda: bool(over), logger=None)
+    over.append('the launch ends')
+    replacer.on('lost')
+    assert asked == [] and replacer.state.phase == 'up'
+    over.clear()
+    replacer.on('lost')
+    assert len(asked) == 1 and replacer.state.phase == 'ending'

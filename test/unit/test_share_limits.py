@@ -79,3 +79,19 @@ def test_wrong_transforms_end_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     bench.expire()
     assert [(len(message), message[-1].child_frame_id) for message in bench.sent] == [
         (1, '0'), (limits.MOST, str(limits.MOST - 1))]
+
+
+def test_each_latched_message_is_kept_from_returning(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench('std_msgs/msg/String')
+    bench.leaving.form = bench.coming.form = Form('std_msgs/msg/String', True, 2)
+    monkeypatch.setattr(limits, 'form_of', lambda _: bench.leaving.form)
+    monkeypatch.setattr(limits, 'others', lambda *_: ['a node'])
+    for data in (b'one', b'two', b'three'):
+        bench.coming.heard(data)
+    # a new subscription hears the latched ones once more
+    bench.leaving.look()
+    for data in (b'two', b'three'):
+        bench.leaving.heard(data)
+    assert bench.sent == [b'one', b'two', b'three']
+    bench.leaving.heard(b'one')
+    assert bench.sent[3:] == [b'one']

@@ -23,6 +23,7 @@ from fogros2 import process
 from fogros2.errors import Cancelled, CommandError, ConnectError, DeadlineExceeded, ShellError
 from fogros2.model import Endpoint, Result
 from fogros2.shell import multiplexed, multiplexer, relay, remote, sync
+from fogros2.shell.local import LocalShell
 
 PINNED = Endpoint('ssh', '198.51.100.7', 2222, 'fog', 'ssh-ed25519 AAAA', '/keys/my key')
 
@@ -247,3 +248,25 @@ def test_folders_begin_in_the_home(folder, there, monkeypatch):
     assert sync.place(folder, remote=True) == f'machine:{there}'
     here = sync.place(folder, remote=False)
     assert here.rstrip('/') == folder.replace('~', '/home/robot').rstrip('/')
+
+
+def test_fetched_file_has_no_set_id_bits(tmp_path):
+    """A machine's program would run as the robot's user for each account of the robot."""
+    there = tmp_path / 'there'
+    there.mkdir()
+    (there / 'tool').write_text('#!/bin/sh\n')
+    (there / 'tool').chmod(0o6755)
+    LocalShell(Endpoint('local'), name='m').fetch(
+        str(there), tmp_path / 'back', known=None, limit=1 << 20, timeout=60.0)
+    assert (tmp_path / 'back/tool').stat().st_mode & 0o7777 == 0o755
+
+
+def test_copy_that_is_too_large_at_its_end_is_refused(tmp_path, monkeypatch):
+    """It may be over between two measurements."""
+    there = tmp_path / 'there'
+    there.mkdir()
+    (there / 'large').write_bytes(os.urandom(100_000))
+    monkeypatch.setattr(sync.Room, 'is_set', lambda room: False)
+    with pytest.raises(ShellError, match='has sent more than'):
+        LocalShell(Endpoint('local'), name='m').fetch(
+            str(there), tmp_path / 'back', known=None, limit=50_000, timeout=60.0)

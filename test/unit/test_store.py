@@ -347,3 +347,33 @@ def test_first_process_runs_where_nobody_may_see_it(monkeypatch):
 def test_home_that_is_no_folder_has_no_records():
     with pytest.raises(StoreError, match="no record of a machine 'a'"):
         Store(Path('/dev/null/state')).load('a')
+
+
+def test_name_whose_lock_was_removed_is_locked_anew(store, monkeypatch):
+    """A former holder removes the file between the open and the lock of the next one."""
+    flock, removed = store_module.fcntl.flock, []
+
+    def late(handle, how):
+        flock(handle, how)
+        if not removed:
+            removed.append(handle.name)
+            os.unlink(handle.name)
+
+    monkeypatch.setattr(store_module.fcntl, 'flock', late)
+    with store.lock('planner'):
+        with pytest.raises(NameTaken):
+            with store.lock('planner'):
+                pass
+    assert removed
+
+
+def test_request_that_cannot_be_kept_leaves_the_record(store, monkeypatch):
+    saved = store.save(record(token='t1', last='abc123'))
+
+    def full(path, data):
+        raise StoreError('No space left on device')
+
+    monkeypatch.setattr(store_module, 'write_private', full)
+    with pytest.raises(StoreError, match='No space left'):
+        store.set_aside(saved)
+    assert store.load('planner') == saved

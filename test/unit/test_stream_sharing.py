@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
 import pytest
 
-from image_transport_h264.budget import Budget
+from image_transport_h264.budget import AHEAD, Budget
 from image_transport_h264.sharing import (
     Claim,
     claim_of,
@@ -177,3 +178,17 @@ def test_share_below_the_minimum_is_reported_once() -> None:
     assert [call.args[0] for call in warning.call_args_list] == [
         '/camera/h264 gets 800 kbit/s of the bandwidth of its machine, and needs at least 1000 '
         'kbit/s: give the machine more bandwidth=, or fewer streams']
+
+
+def test_stream_waits_for_all_that_it_has_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    node, slept = mock.Mock(), []
+    node.declare_parameter.return_value.value = 1.0
+    monkeypatch.setattr(time, 'monotonic', lambda: 100.0)
+    monkeypatch.setattr(time, 'sleep', slept.append)
+    budget = Budget(node, '/camera/h264', lambda: 1)
+    budget.share = 1e6
+    for _ in range(3):
+        budget.sent(25_000, floor=1e5, latency=0.0)
+        budget.pace()
+    # two tenths of a second each, less what a stream may be ahead
+    assert slept == pytest.approx([0.2 - AHEAD, 0.4 - AHEAD, 0.6 - AHEAD])

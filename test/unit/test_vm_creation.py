@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from decimal import Decimal
 import logging
 import threading
 from types import SimpleNamespace
@@ -10,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from fogros2.errors import Cancelled
+from fogros2.errors import Cancelled, ProviderError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
 from fogros2.provider import TAG_NAME, TAG_ROBOT
 from fogros2.provider.aws.cloud import Ec2
@@ -80,3 +82,47 @@ def test_launch_that_ends_does_not_wait_for_a_machine_to_stop(
     monkeypatch.setattr(provider, 'END_TIMEOUT', 0.1)
     with pytest.raises(Cancelled):
         machine.start(f'aws:eu-west-1/i-{"0" * 17}/{"0" * 16}')
+
+
+def test_machine_of_a_region_before_may_exist() -> None:
+    """The region's refusal is sure, its clean-up is not."""
+    def insert(place: Place, *others: Any) -> str:
+        raise CloudError('full', 'wait', full='zone')
+
+    def end_attempt(region: str, attempt: str) -> bool:
+        if region == 'north':
+            raise ProviderError('no answer')
+        return False
+
+    cloud: Any = SimpleNamespace(
+        title='Meadow', text_limit=0, find=lambda *_: [], begin=lambda *_: None, insert=insert,
+        prepare=lambda region, order, types: dict.fromkeys(types), places=lambda *_: ['a'],
+        undo_begin=lambda *_: [], end_attempt=end_attempt)
+    creation = Creation(
+        cloud, cloud, MachineSpec('planner', 'meadow', {}), CreateRequest('token', 'key', {}, 1),
+        Options(region='north'), sources=lambda: [], price=lambda *_: None)
+    with pytest.raises(CloudError, match='full') as caught:
+        creation.run(['north', 'south'])
+    assert caught.value.refused is False and len(caught.value.undo_failures) == 1
+
+
+@pytest.mark.parametrize(('spot', 'tried'), [(False, []), (True, ['small'])])
+def test_type_of_unknown_price_is_above_any_limit(spot: bool, tried: list[str]) -> None:
+    """A cloud itself keeps the limit of a spot machine."""
+    found: list[str] = []
+
+    def insert(place: Place, *others: Any) -> str:
+        found.append(place.kind)
+        return 'm-1'
+
+    cloud: Any = SimpleNamespace(
+        title='Meadow', text_limit=0, find=lambda *_: [], begin=lambda *_: None, insert=insert,
+        prepare=lambda region, order, types: dict.fromkeys(types), places=lambda *_: ['a'],
+        undo_begin=lambda *_: [], end_attempt=lambda *_: False)
+    creation = Creation(
+        cloud, cloud, MachineSpec('planner', 'meadow', {}), CreateRequest('token', 'key', {}, 1),
+        Options(region='north', spot=spot, max_price=Decimal(1)), sources=lambda: [],
+        price=lambda *_: None)
+    with contextlib.nullcontext() if spot else pytest.raises(CloudError, match='max_price=1'):
+        creation.run(['north'])
+    assert found == tried

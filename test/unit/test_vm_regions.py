@@ -14,8 +14,10 @@ import pytest
 
 from fogros2.errors import PrerequisiteError, ProviderError
 from fogros2.provider.aws.cloud import Ec2
+from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.machine_types import Region
 from fogros2.provider.vm import regions
+from fogros2.provider.vm.cloud import CloudError
 
 REGIONS, HOST = Ec2.regions.table, 'ec2.{}.amazonaws.com'.format
 AWS = regions.Regions('AWS', REGIONS, HOST)
@@ -196,3 +198,27 @@ def test_botocore_knows_the_same_regions() -> None:
         pytest.skip(f'boto3 {boto3.__version__} is older than the youngest regions')
     known = set(boto3.session.Session().get_available_regions('ec2'))
     assert set(REGIONS) <= known
+
+
+@pytest.mark.parametrize(('named', 'refusing', 'answers'), [
+    ('', ['north'], [['south']]), ('', ['north', 'south'], None),
+    ('north south', ['north'], None)])
+def test_region_that_the_account_must_not_use(
+    monkeypatch: pytest.MonkeyPatch, named: str, refusing: list[str],
+    answers: list[list[str]] | None,
+) -> None:
+    """It has no machine; but an account that may ask nowhere must not hear of no machines."""
+    monkeypatch.setenv('FOGROS2_AWS_REGIONS', named)
+    cloud = SimpleNamespace(searched_regions=lambda: ['north', 'south'])
+
+    def ask(region: str) -> list[str]:
+        if region in refusing:
+            raise CloudError('this account may not list machines', denied=True)
+        return [region]
+
+    found = AWSProvider().everywhere(cloud, ask)  # type: ignore[arg-type]
+    if answers is None:
+        with pytest.raises(CloudError, match='may not list'):
+            list(found)
+    else:
+        assert list(found) == answers

@@ -57,6 +57,7 @@ def test_a_volume_has_a_path_and_a_size() -> None:
     ({'m': '/data:5TB'}, 'no folder and size'),
     ({'a': '/data', 'b': '/data'}, "'a' and 'b' have one path /data"),
     ({'a': '/data', 'b': '/data/x'}, 'have one path'),
+    ({'a': '/data/x', 'b': '/data'}, 'have one path'),
 ])
 def test_wrong_volumes_are_refused(given: dict[str, str], error: str) -> None:
     with pytest.raises(ConfigurationError, match=error):

@@ -399,3 +399,21 @@ def test_user_outside_of_the_group_is_refused(monkeypatch: pytest.MonkeyPatch) -
         robot.check_sudo()
     assert 'install the helper again' in caught.value.hint  # it may be of another version
     assert 'group fogros2' in caught.value.hint
+
+
+def test_launch_that_ends_while_its_interface_waits_gets_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """``tidy`` has passed it by then, and nothing would take the interface away."""
+    monkeypatch.setattr(vpn, 'RECORDS', tmp_path)
+    monkeypatch.setattr(vpn, 'taken', lambda but: [])
+    ran: list[Command] = []
+    monkeypatch.setattr(vpn, 'run', lambda commands: ran.extend(commands))
+    (tmp_path / 'fog0a1b2c').mkdir()
+    child = subprocess.Popen(['true'])
+    child.wait()
+    vpn.Record('fog0a1b2c', os.getuid(), child.pid, 1).save(tmp_path / 'fog0a1b2c')
+    with pytest.raises(vpn.Refused, match='the launch of fog0a1b2c, process .* has ended'):
+        vpn.up({'name': 'fog0a1b2c', 'network': NETWORK, 'address': '198.18.7.1', 'port': 51820,
+                'ports': [], 'asked': [], 'peers': []}, os.getuid())
+    assert ran == []

@@ -293,3 +293,11 @@ def test_launch_that_hidepid_hides_is_not_dead(
     monkeypatch.setattr(owner, 'process_start', lambda pid: None)
     monkeypatch.setattr(os, 'kill', kill)
     assert owner.abandoned() == dead
+
+
+def test_robot_forwards_nothing_between_vpn_and_other_networks() -> None:
+    """It may be a router, of containers say, and may masquerade what it forwards."""
+    text = script(*WireGuard().up(ROBOT, []))
+    chain = text[text.index('chain forward {'):text.index('chain groups {')]
+    for direction in ('iifname', 'oifname'):
+        assert f'{direction} "{ROBOT.name}" drop' in chain
