@@ -32,7 +32,7 @@ class Choices:
         self._lock = threading.Lock()
         self._resolved: dict[str, MachineSpec] = {}
         self._places: dict[str, list[MachineSpec]] = {}
-        #: By id, machines of earlier launches that were found to run; whoever adopts one takes it.
+        #: By id, machines of earlier launches that were found to run, until they are adopted.
         self.running: dict[str, Machine] = {}
         #: Of each machine that exists or will be created, with ``_clocks`` when it began,
         #: and of those that have ended.
