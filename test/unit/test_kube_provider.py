@@ -139,6 +139,7 @@ def test_a_job_guards_itself():
     assert meta['labels']['sidecar.istio.io/inject'] == 'false'
     assert meta['annotations']['sidecar.istio.io/inject'] == 'false'
     assert meta['annotations']['linkerd.io/inject'] == 'disabled'
+    assert meta['annotations']['karpenter.sh/do-not-disrupt'] == 'true'
 
 
 def test_a_pod_has_net_admin_and_no_other_right():

@@ -55,8 +55,9 @@ def metadata(spec: MachineSpec, request: CreateRequest) -> dict[str, Any]:
     """Return the labels and annotations of a pod."""
     return {
         'labels': {**names.labels(spec.name, request.tags), **_NO_MESH},
-        # An autoscaler must not move the pod to free its node.
+        # An autoscaler must not move the pod to free its node: the Cluster Autoscaler, Karpenter.
         'annotations': {'cluster-autoscaler.kubernetes.io/safe-to-evict': 'false',
+                        'karpenter.sh/do-not-disrupt': 'true',
                         'linkerd.io/inject': 'disabled', **_NO_MESH}}
 
 
