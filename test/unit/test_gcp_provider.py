@@ -179,6 +179,12 @@ def test_accelerators_are_those_of_the_zone():
                    'acceleratorCount': 2}
 
 
+def test_zone_without_the_accelerator_is_passed_over(gce):
+    spec = MachineSpec('planner', 'gcp', {
+        'region': 'us-east1', 'machine_type': 'n1-standard-4', 'accelerators': 'nvidia-tesla-t4'})
+    assert '/us-east1-c/' in GCPProvider().create(spec, request_for(spec))
+
+
 def test_labels_carry_tags_of_any_characters(gce):
     provider = GCPProvider()
     spec = MachineSpec('planner', 'gcp', {
@@ -342,11 +348,17 @@ def answer(reason, message='said', code=400):
     return {'error': {'code': code, 'message': message, 'errors': [{'reason': reason}]}}
 
 
-@pytest.mark.parametrize(('status', 'reason', 'full', 'certain'), [
-    (403, 'quotaExceeded', 'region', True), (403, 'forbidden', '', True),
-    (503, 'backendError', '', False), (400, 'invalid', '', True)])
-def test_refusal_tells_what_can_be_tried(status, reason, full, certain):
-    error = failures.refused(status, answer(reason), 'creating it')
+@pytest.mark.parametrize(('status', 'reason', 'words', 'full', 'certain'), [
+    (403, 'quotaExceeded', '', 'region', True), (403, 'forbidden', '', '', True),
+    (503, 'backendError', '', '', False), (400, 'invalid', '', '', True),
+    (404, 'notFound', "The resource 'projects/p/zones/us-east1-b/acceleratorTypes/nvidia-tesla-t4'"
+     ' was not found', 'zone', True),
+    (400, 'invalid', "Invalid value for field 'resource.guestAccelerators[0].acceleratorType': "
+     "''. The referenced accelerator resource cannot be found.", 'zone', True),
+    (404, 'notFound', "The resource 'projects/ubuntu-os-accelerator-images/global/images/x' was "
+     'not found', '', True)])
+def test_refusal_tells_what_can_be_tried(status, reason, words, full, certain):
+    error = failures.refused(status, answer(reason, words), 'creating it')
     assert (error.full, error.refused) == (full, certain)
     assert 'creating it failed' in str(error)
 

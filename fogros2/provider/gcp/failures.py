@@ -30,6 +30,8 @@ _FAILURES = {
     **dict.fromkeys(('QUOTA_EXCEEDED', 'LIMIT_EXCEEDED'), Failure(
         '', 'ask for more at IAM & Admin, Quotas, or take another type or region',
         full='region')),
+    'NO_ACCELERATOR': Failure(
+        '', 'gcloud compute accelerator-types list shows the zones that have it', full='zone'),
     'RATE_LIMIT_EXCEEDED': Failure(
         'Google asks for fewer requests', 'try again in a minute', temporary=True),
     **dict.fromkeys(('USER_RATE_LIMIT_EXCEEDED', 'RESOURCE_NOT_READY'), Failure(temporary=True)),
@@ -65,6 +67,8 @@ def refused(status: int, answer: Any, what: str) -> FogError:
         error, message, code = {}, f'Google answered with status {status}', ''
     if status == 401:
         code = 'AUTH_ERROR'
+    elif re.search('acceleratorType.*not (be )?found', message):
+        code = 'NO_ACCELERATOR'
     elif status == 404 and re.search(r"resource 'projects/[^/']+'", message):
         code = 'PROJECT_NOT_FOUND'
     elif status in (404, 429):

@@ -20,7 +20,8 @@ TYPES: dict[str, tuple[int, int, str, tuple[str, int]]] = {
     'g2-standard-8': (8, 32768, 'X86_64', ('nvidia-l4', 1))}
 #: Types that only one zone of a region has.
 RARE = {'g2-standard-4': 'b', 'g2-standard-8': 'b', 't2a-standard-1': 'a'}
-ACCELERATORS = ('nvidia-tesla-t4', 'nvidia-l4')
+#: GPUs, and the zones without them.
+ACCELERATORS = {'nvidia-tesla-t4': ('us-east1-b',), 'nvidia-l4': ()}
 DISK_TYPES = ('pd-standard', 'pd-balanced', 'pd-ssd', 'hyperdisk-balanced')
 #: Public images: project, name, family, architecture, size in GB.
 IMAGES = (

@@ -405,8 +405,9 @@ class Project:
         _check_scheduling(body.get('scheduling', {}), bool(
             body.get('guestAccelerators') or kind.get('accelerators')))
         for gpu in body.get('guestAccelerators', ()):
-            if _last(gpu['acceleratorType']) not in catalogue.ACCELERATORS:
-                raise Refusal('notFound', f"The resource '{gpu['acceleratorType']}' was not found")
+            if zone in catalogue.ACCELERATORS.get(_last(gpu['acceleratorType']), (zone,)):
+                raise Refusal('notFound', f"The resource 'projects/{self.name}/"
+                              f"{gpu['acceleratorType']}' was not found")
             if not body['machineType'].rpartition('/')[2].startswith('n1-'):
                 raise Refusal('invalid', 'Only N1 machine types take accelerators.')
         for account in body.get('serviceAccounts', ()):
