@@ -176,7 +176,10 @@ def test_a_machine_is_asked_for_as_it_has_to_be():
             'DeleteOnTermination': True}}],
         'TagSpecifications': [{'ResourceType': kind, 'Tags': listed}
                               for kind in ('instance', 'volume', 'network-interface')],
-        'SecurityGroupIds': ['sg-own'],
+        # EC2 chooses a subnet, which may give no public addresses itself
+        'NetworkInterfaces': [{
+            'DeviceIndex': 0, 'Groups': ['sg-own'], 'AssociatePublicIpAddress': True,
+            'DeleteOnTermination': True}],
         'IamInstanceProfile': {'Name': 'robots'},
     }
 

@@ -103,13 +103,11 @@ def run_request(
             {'ResourceType': kind, 'Tags': tag_list({**tags, TAG_DISK: str(disk)})}
             for kind in ('instance', 'volume', 'network-interface',
                          *(('spot-instances-request',) if options.spot else ()))],
+        # without a subnet, EC2 chooses a default one, which may give no public addresses itself
+        'NetworkInterfaces': [{
+            'DeviceIndex': 0, 'Groups': [group], 'AssociatePublicIpAddress': True,
+            'DeleteOnTermination': True, **({'SubnetId': place.zone} if place.zone else {})}],
     }
-    if place.zone:
-        words['NetworkInterfaces'] = [{
-            'DeviceIndex': 0, 'SubnetId': place.zone, 'Groups': [group],
-            'AssociatePublicIpAddress': True, 'DeleteOnTermination': True}]
-    else:
-        words['SecurityGroupIds'] = [group]
     if options.iam_instance_profile:
         key = 'Arn' if options.iam_instance_profile.startswith('arn:') else 'Name'
         words['IamInstanceProfile'] = {key: options.iam_instance_profile}
