@@ -637,9 +637,9 @@ def test_the_notice_of_a_spot_instance_is_asked_for_with_a_token(echo, answers, 
 # -- errors -------------------------------------------------------------------------------------
 
 
-def refused(code, message='', operation='RunInstances', decode=None):
+def refused(code, message='', operation='RunInstances'):
     return failures.refused({'Error': {'Code': code, 'Message': message}}, operation,
-                            "creating 'planner' in eu-central-1", decode)
+                            "creating 'planner' in eu-central-1")
 
 
 @pytest.mark.parametrize(('code', 'kind', 'words'), [
@@ -666,22 +666,32 @@ def test_a_page_of_a_proxy_is_told_without_its_markup():
     assert '502 Bad gateway' in told and '<' not in told and len(told) < 400
 
 
-def test_missing_action_of_a_policy_is_named():
-    plain = ('You are not authorized to perform this operation. User: arn:aws:iam::1:user/x is '
-             'not authorized to perform: ec2:CreateTags on resource: arn:aws:ec2:* because no '
-             'identity-based policy allows the ec2:CreateTags action.')
-    coded = ('You are not authorized to perform this operation. Encoded authorization failure '
-             'message: abc-DEF_123')
-    assert 'does not allow ec2:CreateTags' in str(refused('UnauthorizedOperation', plain))
-    told = json.dumps({'allowed': False, 'context': {'action': 'iam:PassRole'}})
-    asked = []
-    assert 'does not allow iam:PassRole' in str(refused(
-        'UnauthorizedOperation', coded, decode=lambda text: asked.append(text) or told))
-    assert asked == ['abc-DEF_123']
-    assert 'does not allow ec2:RunInstances' in str(refused(
-        'UnauthorizedOperation', coded, decode=lambda text: ''))
-    assert 'does not allow ssm:GetParameter' in str(refused(
-        'AccessDeniedException', 'no', operation='GetParameter'))
+DENIED = ('You are not authorized to perform this operation. User: arn:aws:iam::1:user/x is not '
+          'authorized to perform: ec2:CreateTags on resource: arn:aws:ec2:* {}. Encoded '
+          'authorization failure message: abc-DEF_123')
+
+
+@pytest.mark.parametrize(('code', 'message', 'operation', 'action'), [
+    ('UnauthorizedOperation', DENIED.format(
+        'because no identity-based policy allows the ec2:CreateTags action'), 'RunInstances',
+     'ec2:CreateTags'),
+    ('UnauthorizedOperation', 'You are not authorized to perform this operation.', 'RunInstances',
+     'ec2:RunInstances'),
+    ('AccessDeniedException', 'no', 'GetParameter', 'ssm:GetParameter')])
+def test_missing_action_of_a_policy_is_named(code, message, operation, action):
+    error = refused(code, message, operation)
+    assert error.args[0].endswith(f'the policy of these credentials does not allow {action}')
+    assert f'add {action} to it' in error.hint and error.denied
+
+
+@pytest.mark.parametrize('why', [
+    'with an explicit deny in a service control policy: arn:aws:organizations::1:policy/o-1/'
+    f'service_control_policy/p-{"1" * 200}',
+    'because no permissions boundary allows the ec2:CreateTags action'])
+def test_denial_of_another_policy_keeps_the_words_of_aws(why):
+    error = refused('UnauthorizedOperation', DENIED.format(why))
+    assert error.args[0].endswith(f'ec2:CreateTags on resource: arn:aws:ec2:* {why}.')
+    assert 'ask who manages' in error.hint and error.denied
 
 
 @pytest.mark.parametrize('name', ['AWS_ACCESS_KEY_ID', 'AWS_PROFILE'])

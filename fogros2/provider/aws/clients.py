@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-import contextlib
 import functools
 import os
 import threading
 import time
 from typing import Any, Optional, TypeVar
 
-from fogros2.errors import FogError, PrerequisiteError
+from fogros2.errors import PrerequisiteError
 from fogros2.provider.aws.failures import Expired, translated
 from fogros2.provider.vm import account as vm
 from fogros2.provider.vm.failures import Fields, SETTLING, unless_gone
@@ -126,7 +125,7 @@ class Account(vm.Account):
         self, ask: Callable[[Any], T], service: str, region: str, operation: str, what: str,
     ) -> T:
         def sent(client: Any) -> T:
-            with translated(what, region, decode=lambda message: self._decode(region, message)):
+            with translated(what, region):
                 return ask(client)
 
         def asked() -> T:
@@ -145,14 +144,6 @@ class Account(vm.Account):
             # not if another thread has done it
             if client in self._known.values():
                 self._known.clear()
-
-    def _decode(self, region: str, message: str) -> str:
-        """Return an encoded authorization failure as JSON, '' if that isn't allowed either."""
-        with contextlib.suppress(FogError), translated('decoding a message of AWS', region):
-            answer = self.client('sts', region, hasty=True).decode_authorization_message(
-                EncodedMessage=message)
-            return str(answer['DecodedMessage'])
-        return ''
 
 
 @functools.lru_cache(maxsize=1)

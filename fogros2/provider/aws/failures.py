@@ -8,11 +8,10 @@ common errors of all AWS services.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import contextlib
-import json
 import re
-from typing import Any, Optional
+from typing import Any
 
 from fogros2.errors import ConfigurationError, FogError, PrerequisiteError, ProviderError
 from fogros2.provider.vm.failures import CodedError, Failure, LENGTH, not_the_cloud, Silent
@@ -126,7 +125,8 @@ _UNSENT = {
     **dict.fromkeys(('ConfigParseError', 'ConfigNotFound'), ('{}', 'check ~/.aws/config')),
 }
 _ACTION = re.compile(r'not authorized to perform:? ([A-Za-z0-9-]+:[A-Za-z0-9*]+)')
-_ENCODED = re.compile(r'[Ee]ncoded authorization failure message: *([\w-]+)')
+#: A policy in which the user can add nothing, such as one of the organisation.
+_OTHER_POLICY = re.compile('explicit deny|because no (?!identity-based)')
 
 
 class AwsError(CodedError):
@@ -137,14 +137,11 @@ class AwsError(CodedError):
 
 
 @contextlib.contextmanager
-def translated(
-    what: str, region: str = '', *, decode: Optional[Callable[[str], str]] = None,
-) -> Iterator[None]:
+def translated(what: str, region: str = '') -> Iterator[None]:
     """
     Convert the errors of boto3 in the block to FogErrors.
 
     :param what: action of the block, such as 'creating the security group'.
-    :param decode: converts an encoded authorization failure to its JSON, '' if it cannot.
     :raises PrerequisiteError: no credentials, bad ones, no route to AWS, a wrong clock.
     :raises AwsError: AWS refused.
     """
@@ -155,25 +152,28 @@ def translated(
     try:
         yield
     except exceptions.ClientError as error:
-        raise refused(error.response, error.operation_name, where, decode) from error
+        raise refused(error.response, error.operation_name, where) from error
     except ResponseParserError as error:
         raise not_the_cloud('AWS', where) from error
     except exceptions.BotoCoreError as error:
         raise _unsent(error, where) from error
 
 
-def refused(
-    response: Any, operation: str, where: str, decode: Optional[Callable[[str], str]] = None,
-) -> FogError:
+def refused(response: Any, operation: str, where: str) -> FogError:
     """Return the error for a refusal; ``response`` as botocore has it."""
     details = response.get('Error') or {}
     code, message = str(details.get('Code', '')), _plain(str(details.get('Message', '')))
     status = (response.get('ResponseMetadata') or {}).get('HTTPStatusCode', 400)
     if AwsError.known(code).denied:
-        action = denied_action(message, operation, decode)
+        if _OTHER_POLICY.search(message):
+            return AwsError(f'{where} failed: {message}',
+                            'ask who manages this policy, or the organisation of the account',
+                            code=code)
+        action = denied_action(message, operation)
         return AwsError(f'{where} failed: the policy of these credentials does not allow {action}',
                         f'add {action} to it: doc/aws.md has the whole policy', code=code)
-    error = AwsError.of(code, message, where, status)
+    short = message if len(message) <= LENGTH else f'{message[:LENGTH]}...'
+    error = AwsError.of(code, short, where, status)
     if code.startswith('Invalid') and message and AwsError.known(code).reason:
         error.args = (f'{error.args[0]} ({message[:160].rstrip(".")})',)
     return error
@@ -183,24 +183,16 @@ def _plain(text: str) -> str:
     """Return a message in one line; the answer of a proxy is a whole page."""
     if text.lstrip().startswith('<'):
         text = re.sub(r'<[^>]*>', ' ', text)
-    words = ' '.join(text.split())
-    # an encoded message must stay complete
-    return words if _ENCODED.search(words) or len(words) <= LENGTH else f'{words[:LENGTH]}...'
+    # few users may decode the rest
+    return ' '.join(text.partition('Encoded authorization failure')[0].split())
 
 
-def denied_action(
-    message: str, operation: str, decode: Optional[Callable[[str], str]] = None,
-) -> str:
+def denied_action(message: str, operation: str) -> str:
     """
     Return the action that a policy lacks, such as 'ec2:RunInstances'.
 
-    A call may need other actions too (tags at creation, a role). AWS names the action in plain
-    text, or encoded for users who may ``sts:DecodeAuthorizationMessage``.
+    A call may need other actions too (tags at creation, a role), which AWS names.
     """
-    encoded = _ENCODED.search(message)
-    if encoded and decode:
-        with contextlib.suppress(ValueError, KeyError, TypeError):
-            return str(json.loads(decode(encoded[1]))['context']['action'])
     named = _ACTION.search(message)
     if named:
         return named[1]

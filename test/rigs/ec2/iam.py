@@ -64,12 +64,9 @@ CHANGE_IMAGES = (
     'ec2:DeregisterImage',
 )
 TAG = ('ec2:CreateTags',)
-#: Optional: with it, messages name the action that was refused.
-HELPFUL = ('sts:DecodeAuthorizationMessage',)
-
 #: With ``volumes=`` alone.
 VOLUMES = (*ATTACH, 'ec2:CreateVolume')
-ACTIONS = (*LOOK, *PRICES, *MAKE, *CHANGE, *CHANGE_VOLUMES, *CHANGE_IMAGES, *TAG, *HELPFUL)
+ACTIONS = (*LOOK, *PRICES, *MAKE, *CHANGE, *CHANGE_VOLUMES, *CHANGE_IMAGES, *TAG)
 #: Calls that no policy can refuse.
 FREE = ('sts:GetCallerIdentity',)
 
@@ -81,7 +78,7 @@ def policy() -> dict[str, Any]:
     born = {'StringEquals': {'ec2:CreateAction': [
         'CreateImage', 'CreateSecurityGroup', 'CreateVolume', 'ImportKeyPair', 'RunInstances']}}
     statements: list[tuple[str, tuple[str, ...], dict[str, Any]]] = [
-        ('Look', (*LOOK, *PRICES, *HELPFUL), {}),
+        ('Look', (*LOOK, *PRICES), {}),
         ('Make', MAKE, {}),
         ('TagWhatIsMade', TAG, born),
         ('TagMachines', TAG, machine),
