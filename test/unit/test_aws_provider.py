@@ -650,6 +650,7 @@ def refused(code, message='', operation='RunInstances'):
     ('InsufficientInstanceCapacity', failures.AwsError, 'regions='),
     ('RequestLimitExceeded', failures.AwsError, 'fewer requests'),
     ('SomethingNew', failures.AwsError, 'as AWS said'),
+    ('OptInRequired', PrerequisiteError, 'as AWS said'),
 ])
 def test_every_known_refusal_says_what_to_do(code, kind, words):
     error = refused(code, 'as AWS\nsaid')

@@ -42,8 +42,8 @@ _FAILURES = {
     'RequestTimeTooSkewed': Failure(
         "this computer's clock is wrong", 'timedatectl set-ntp true', PrerequisiteError),
     'OptInRequired': Failure(
-        'the account has not enabled this region or service',
-        'enable it in the AWS console, or name another region=', PrerequisiteError),
+        '', 'subscribe to the image at AWS Marketplace, or enable the region in the AWS console',
+        PrerequisiteError),
     'PendingVerification': Failure(
         'AWS is still verifying this account for this region', 'it takes up to four hours',
         PrerequisiteError),
