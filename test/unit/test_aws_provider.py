@@ -661,6 +661,12 @@ def test_every_known_refusal_says_what_to_do(code, kind, words):
     assert '\n' not in str(error)
 
 
+def test_type_outside_of_the_free_plan_has_a_remedy():
+    error = refused('InvalidParameterCombination', 'The specified instance type is not eligible '
+                    'for Free Tier. For a list of Free Tier instance types, run ...')
+    assert 'm7i-flex.large' in error.hint
+
+
 def test_a_page_of_a_proxy_is_told_without_its_markup():
     page = '<!doctype html>\n<html><title>502</title>\n<h1>Bad gateway</h1>' + 'x' * 1000
     told = str(refused('502', page))

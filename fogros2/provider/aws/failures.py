@@ -176,6 +176,9 @@ def refused(response: Any, operation: str, where: str) -> FogError:
     error = AwsError.of(code, short, where, status)
     if code.startswith('Invalid') and message and AwsError.known(code).reason:
         error.args = (f'{error.args[0]} ({message[:160].rstrip(".")})',)
+    if 'Free Tier' in message:
+        error.hint = ("upgrade the account to AWS's paid plan, or name a type of the free plan: "
+                      "ec2_instance_type='m7i-flex.large'")
     return error
 
 
