@@ -667,6 +667,16 @@ def test_type_outside_of_the_free_plan_has_a_remedy():
     assert 'm7i-flex.large' in error.hint
 
 
+def test_machine_without_the_right_to_its_disks_key_names_it(monkeypatch):
+    ended = instance('terminated', StateReason={
+        'Code': 'Client.InternalError',
+        'Message': 'Client.InternalError: Client error on launch'})
+    monkeypatch.setattr(Ec2, 'get', lambda *words: instances.vm_of('eu-central-1', ended))
+    with pytest.raises(ProviderError, match='Client error on launch') as caught:
+        AWSProvider().reachable(machine_of(ended).id, name='planner', timeout=5.0)
+    assert 'kms:CreateGrant' in caught.value.hint
+
+
 def test_a_page_of_a_proxy_is_told_without_its_markup():
     page = '<!doctype html>\n<html><title>502</title>\n<h1>Bad gateway</h1>' + 'x' * 1000
     told = str(refused('502', page))

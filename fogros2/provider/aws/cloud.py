@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import os
+import re
 import time
 from typing import Any, Optional
 
@@ -79,6 +80,12 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
         if matches[0]['State']['Name'] == 'terminated' and not self._account.just_made(vm):
             raise MachineNotFound(f'{vm} in {region} was terminated')
         return instances.vm_of(region, matches[0])
+
+    def end_hint(self, reason: str) -> str:
+        if re.match(r'Client\.(InternalError|InvalidKMSKey)', reason):
+            return ("may these credentials use the KMS key of the account's disks "
+                    '(kms:CreateGrant and others)? See doc/aws.md')
+        return super().end_hint(reason)
 
     def is_marked(self, machine: VmId) -> bool:
         """Ask the spot request, which EC2 marks two minutes before the instance's end."""

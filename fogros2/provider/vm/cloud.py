@@ -326,6 +326,10 @@ class VmCloud(abc.ABC):
     def find(self, region: str, tags: Mapping[str, str]) -> Iterable[Vm]:
         """Return the machines of FogROS2 that have all of ``tags``, in any state but deleted."""
 
+    def end_hint(self, reason: str) -> str:
+        """Return the remedy for a machine that ended while it was coming up."""
+        return f'the console of {self.title} has its system log'
+
     @abc.abstractmethod
     def get(self, region: str, vm: str) -> Optional[Vm]:
         """

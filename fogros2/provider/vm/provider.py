@@ -284,7 +284,7 @@ class VmProvider(Provider):
                 raise ProviderError(
                     f"'{name}' ({machine.vm}) ended while it was coming up: "
                     f'{vm.reason or f"{cloud.title} gives no reason"}',
-                    f'the console of {cloud.title} has its system log')
+                    cloud.end_hint(vm.reason))
             report = self.machine_of(vm)
             return dataclasses.replace(report, id=machine_id, note='; '.join(
                 cloud.notes[machine.vm])) if report.endpoint is not None else None
