@@ -19,6 +19,7 @@ from fogros2 import kubernetes_client
 from fogros2.errors import (
     Cancelled,
     ConfigurationError,
+    DeadlineExceeded,
     FogError,
     MachineNotFound,
     ProviderError,
@@ -37,6 +38,7 @@ from fogros2.provider.kubernetes import (
     names,
     pods,
     start,
+    ways,
 )
 from fogros2.provider.kubernetes.exposure import Exposure
 from fogros2.provider.kubernetes.names import MachineId
@@ -647,7 +649,7 @@ def echo(tmp_path):
         link.bind(('127.0.0.1', 0))
         port = link.getsockname()[1]
     program = boot.ECHO.replace("'/run/fogros2'", repr(str(tmp_path)))
-    child = subprocess.Popen(['python3', '-ISc', program, str(port), 'word', '20'])
+    child = subprocess.Popen(['python3', '-ISc', program, str(port), 'word'])
     yield port
     (tmp_path / 'an agent').mkdir()
     # it leaves the port to the VPN as soon as an agent has come
@@ -659,6 +661,38 @@ def test_first_address_that_answers_is_found(echo):
     assert exposure.first_to_answer(places, 'word', timeout=10.0) == ('127.0.0.1', echo)
     # another launch's question isn't answered
     assert exposure.first_to_answer(places, 'other', timeout=0.3) is None
+
+
+@pytest.mark.parametrize(('expose', 'waited', 'deleted'), [
+    ('auto', 180.0, ['/api/v1/namespaces/robots/services/fogros2-talker']),
+    ('load_balancer', 420.0, [])])
+def test_silent_load_balancer_is_not_billed(expose, waited, deleted):
+    timeouts, gone = [], []
+
+    class Cluster:
+        context, server = '', 'https://1.eks.amazonaws.com'
+
+        def request(self, method, target, body=None, **more):
+            if method == 'DELETE':
+                gone.append(target)
+            return {'metadata': {'ownerReferences': [{'uid': 'its-uid'}]},
+                    'spec': {'type': 'LoadBalancer', 'ports': [{}]}}
+
+        def follow(self, *words, timeout, **more):
+            timeouts.append(timeout)
+            raise DeadlineExceeded('a load balancer')
+
+    job = {'metadata': {'annotations': {names.EXPOSE: expose}}}
+    where = MachineId('robots', 'fogros2-talker', 'its-uid')
+
+    def find():
+        return ways.find(Cluster(), where, job, {}, timeout=290.0, cancel=threading.Event())
+
+    if expose == 'auto':
+        assert find().kind == 'pod_dials_robot'
+    else:
+        assert 'no load balancer came in 420 s' in str(raised(ProviderError, find))
+    assert (timeouts, gone) == ([waited], deleted)
 
 
 def test_cancel_ends_the_search_for_an_exposure():

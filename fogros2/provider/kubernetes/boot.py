@@ -24,12 +24,12 @@ UID = 1729
 #: Answers each datagram that begins with its word, until an agent starts, which needs the port for
 #: the VPN.
 ECHO = """\
-import os, socket, sys, time
+import os, socket, sys
 s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 s.bind(('', int(sys.argv[1])))
 s.settimeout(0.1)
-word, last = sys.argv[2].encode(), time.monotonic() + float(sys.argv[3])
-while time.monotonic() < last and not os.listdir('/run/fogros2'):
+word = sys.argv[2].encode()
+while not os.listdir('/run/fogros2'):
     try:
         data, who = s.recvfrom(512)
         if data.startswith(word):
@@ -48,7 +48,7 @@ while True:
 """
 
 SCRIPT = r"""
-user=$1 timeout=$2 port=$3 word=$4 listen=$5 echo=$6 alive=$7
+user=$1 timeout=$2 port=$3 word=$4 echo=$5 alive=$6
 agents=/run/fogros2 notice=/run/fogros2-notice grace=@GRACE@ uid=@UID@
 # without a new process, because each pod of a node calls this each second
 clock() { read -r now _ </proc/uptime; now=${now%.*}; }
@@ -91,7 +91,7 @@ fi
 if [ "$user" != root ] && [ -d /etc/sudoers.d ]; then
     (umask 277; echo "$user ALL=(ALL:ALL) NOPASSWD: ALL" >/etc/sudoers.d/fogros2)
 fi
-[ "$port" = 0 ] || python3 -ISc "$echo" "$port" "$word" "$listen" &
+[ "$port" = 0 ] || python3 -ISc "$echo" "$port" "$word" &
 [ -z "$alive" ] || python3 -ISc "$alive" &
 clock
 since=$now before=none
@@ -120,7 +120,7 @@ done
 
 
 def arguments(
-    user: str, timeout: float, port: int, word: str, listen: float, *, alive: bool = False,
+    user: str, timeout: float, port: int, word: str, *, alive: bool = False,
 ) -> list[str]:
     """
     Return the pod's command.
@@ -128,8 +128,7 @@ def arguments(
     :param timeout: seconds for which the pod waits for an agent.
     :param port: UDP port for the robot's probes, 0 for none.
     :param word: first word of the probes; others are not answered.
-    :param listen: seconds for which probes are answered.
     :param alive: whether another container of the pod probes this one.
     """
     return ['/bin/sh', '-c', SCRIPT, 'fogros2', user, str(max(1, round(timeout))), str(port),
-            word, f'{listen:g}', ECHO, ALIVE if alive else '']
+            word, ECHO, ALIVE if alive else '']

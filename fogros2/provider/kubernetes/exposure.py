@@ -31,6 +31,8 @@ ROUNDS = 10
 LOAD_BALANCER = 180.0
 #: The same for load balancers that the cluster itself makes, which may be switched off.
 LOAD_BALANCER_INSIDE = 60.0
+#: The same where no other way is tried: AWS registers a pod in up to 300 s.
+LOAD_BALANCER_ALONE = 420.0
 #: Time-out of a node port's first answer, in seconds.
 NODE_PORT = 6.0
 

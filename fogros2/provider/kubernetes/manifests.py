@@ -17,8 +17,6 @@ from fogros2.provider.kubernetes.options import Options
 TTL = 60
 #: Seconds for which a pod waits for its launch, after its image was pulled.
 BOOT = 600.0
-#: Seconds for which a pod answers probes for UDP.
-LISTEN = 180.0
 #: Port on which images of web applications serve HTTP.
 APPLICATION_PORT = 8080
 #: Limits of the application, a file server, if the machine's container has limits of that kind.
@@ -76,7 +74,7 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
         'name': names.CONTAINER, 'image': image_for(options, request.dependencies),
         'imagePullPolicy': 'IfNotPresent',
         'command': boot.arguments(
-            options.user, max(BOOT, spec.robot_timeout), port, word(request.token), LISTEN,
+            options.user, max(BOOT, spec.robot_timeout), port, word(request.token),
             alive=bool(request.application)),
         'env': [{'name': name, 'value': value} for name, value in options.env.items()],
         'securityContext': {

@@ -167,6 +167,7 @@ class _Search:
     ) -> None:
         self._api = api
         self._where = where
+        self._path = path('services', where.namespace, where.job)
         self._pod = pod
         self._cancel = cancel
         self._port = int(names.annotation(job, names.VPN_PORT) or 0)
@@ -178,7 +179,8 @@ class _Search:
         deadline = time.monotonic() + timeout
         service = self._service()
         if service is not None and service['spec']['type'] == 'LoadBalancer':
-            limit = min(exposure.timeout(maker(self._api, self._cancel)), timeout * 0.8)
+            limit = exposure.LOAD_BALANCER_ALONE if expose != 'auto' else min(
+                exposure.timeout(maker(self._api, self._cancel)), timeout * 0.8)
             if (result := self._load_balancer(limit)) is not None:
                 return result
         if service is not None and expose in ('auto', 'node_port'):
@@ -187,6 +189,10 @@ class _Search:
                 return result
         reason = '; '.join(self._failed)
         if expose == 'auto':
+            if service is not None:
+                # The cloud would bill its load balancer for the machine's life.
+                with contextlib.suppress(ApiError, Unreachable):
+                    self._api.request('DELETE', self._path, cancel=self._cancel)
             return Exposure('pod_dials_robot', '', 0, reason)
         raise ProviderError(
             f"no UDP gets to the pod of '{self._where.job}' by expose='{expose}': {reason}",
@@ -194,8 +200,7 @@ class _Search:
 
     def _service(self) -> Optional[dict[str, Any]]:
         """Return the Service, None if there is none."""
-        service = existing(
-            self._api, path('services', self._where.namespace, self._where.job), self._cancel)
+        service = existing(self._api, self._path, self._cancel)
         if service is None:
             self._failed.append('the cluster allows no Service')
         elif not owned(service, self._where.uid):
