@@ -30,6 +30,7 @@ from fogros2.provider import TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.kubernetes import (
     boot,
     container_of,
+    ending,
     exposure,
     hints,
     kind_of,
@@ -693,6 +694,21 @@ def test_silent_load_balancer_is_not_billed(expose, waited, deleted):
     else:
         assert 'no load balancer came in 420 s' in str(raised(ProviderError, find))
     assert (timeouts, gone) == ([waited], deleted)
+
+
+def test_deletion_waits_for_a_slow_load_balancer():
+    waits = {}
+
+    class Cluster:
+        def request(self, method, target, body=None, **more):
+            return {'items': []}
+
+        def follow(self, target, look, *, timeout, **more):
+            waits[target] = timeout
+
+    ending.end(Cluster(), MachineId('robots', 'fogros2-talker', 'its-uid'))
+    # for AWS's controller, a security group alone may take two minutes
+    assert waits == {'/apis/batch/v1/namespaces/robots/jobs': 300.0}
 
 
 def test_cancel_ends_the_search_for_an_exposure():

@@ -13,8 +13,10 @@ from fogros2.provider.kubernetes.names import MachineId
 
 #: Grace period of a pod that the robot deletes, in seconds: its nodes have ended before.
 GRACE = 1
-#: Time-out of the deletion, in seconds.
-GONE = 120.0
+#: Time-out of a pod's end, in seconds.
+POD = 120.0
+#: Time-out of the deletion, in seconds: clouds need minutes to delete a load balancer.
+GONE = 300.0
 #: Seconds after which to look for a pod that the Job created at the last moment.
 AGAIN = 1.5
 
@@ -87,7 +89,7 @@ def _end_pods(api: Api, where: MachineId) -> None:
         return None if uids else True
 
     if uids:
-        api.follow(target, look, again=again, timeout=GONE, labelSelector=labels,
+        api.follow(target, look, again=again, timeout=POD, labelSelector=labels,
                    what=f"the pod of '{where.job}' to end")
     if pod_list:
         # Nothing runs in the pods; the node would need seconds to clean up.
