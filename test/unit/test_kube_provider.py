@@ -490,6 +490,9 @@ def test_reason_of_the_end_is_found():
     ('ErrImagePull', 'pull access denied, repository does not exist or may require '
      'authorization', True, 'image_pull_secrets='),
     ('ErrImagePull', 'dial tcp 1.2.3.4:443: i/o timeout', False, 'reach the registry'),
+    ('ErrImagePull', 'unexpected status code https://registry-1.docker.io/v2/library/ros/manifests/'
+     'sha256:e401: 429 Too Many Requests - Server message: toomanyrequests: You have reached your '
+     'unauthenticated pull rate limit.', False, 'limits pulls without a login'),
     ('InvalidImageName', "couldn't parse image reference", True, "no image's name"),
     ('CreateContainerConfigError', 'secret "x" not found', True, '')])
 def test_unavailable_image_is_reported(reason, message, final, word):
@@ -514,7 +517,9 @@ def test_repeated_image_pull_keeps_its_first_reason():
     ('0/1 nodes are available: 1 Insufficient cpu.', 'mcpu='),
     ("0/1 nodes are available: 1 node(s) didn't match Pod's node affinity/selector.",
      'node_selector='),
-    ('0/1 nodes are available: 1 node(s) had untolerated taint {gpu: true}.', 'tolerations=')])
+    ('0/1 nodes are available: 1 node(s) had untolerated taint {gpu: true}.', 'tolerations='),
+    ('Pod not supported on Fargate: invalid SecurityContext fields: Capabilities added: NET_ADMIN',
+     'without a Fargate profile')])
 def test_pod_that_fits_on_no_node_is_reported(message, word):
     trouble = pods.trouble_of(pod_of('Pending', state={}, conditions=[
         {'type': 'PodScheduled', 'status': 'False', 'reason': 'Unschedulable',

@@ -125,6 +125,8 @@ def of_scheduling(message: str) -> str:
         hints.append('no node carries the labels of node_selector=')
     if 'taint' in message:
         hints.append('nodes carry taints: name them in tolerations=')
+    if 'on Fargate' in message:
+        hints.append('Fargate refuses NET_ADMIN: use a namespace= without a Fargate profile')
     return '; '.join(hints) or '`kubectl describe nodes` shows what they have'
 
 
@@ -133,6 +135,9 @@ def of_image(reason: str, message: str, image: str) -> str:
     text = message.lower()
     if reason == 'InvalidImageName':
         return f"container_image='{image}' is no image's name"
+    if re.search('429 too many|toomanyrequests', text):
+        return ('the registry limits pulls without a login: name a secret in image_pull_secrets=, '
+                'or an image of another registry in container_image=')
     if re.search(r'unauthorized|authorization|denied|forbidden|credentials|401|403', text):
         return ('the registry wants a login, or has no such image: check container_image=, and '
                 'name the secret in image_pull_secrets=')
