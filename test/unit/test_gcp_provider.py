@@ -374,6 +374,12 @@ def test_page_of_googles_front_end_is_a_temporary_fault():
     (403, answer('accessNotConfigured'), PrerequisiteError, 'gcloud services enable'),
     (404, answer('notFound', "The resource 'projects/x' was not found"), PrerequisiteError,
      'check project_id='),
+    (404, answer('notFound', "The resource 'projects/x/global/networks/default' was not found"),
+     ProviderError, 'name a network of the project: network='),
+    (412, answer('conditionNotMet', 'Constraint constraints/compute.vmExternalIpAccess violated '
+                 'for project 1. Add instance projects/p/zones/z/instances/fogros2-x to the '
+                 'constraint to use external IP with it.'),
+     ProviderError, 'ask who has assigned the policy'),
     (407, None, PrerequisiteError, 'is there a proxy'), (200, 'x', PrerequisiteError, 'a proxy')])
 def test_unusable_accounts_are_named(status, found, kind, words):
     error = failures.refused(status, found, 'looking')

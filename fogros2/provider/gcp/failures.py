@@ -32,6 +32,8 @@ _FAILURES = {
         full='region')),
     'NO_ACCELERATOR': Failure(
         '', 'gcloud compute accelerator-types list shows the zones that have it', full='zone'),
+    'NO_NETWORK': Failure('', 'name a network of the project: network='),
+    'POLICY': Failure('', 'ask who has assigned the policy', denied=True),
     'RATE_LIMIT_EXCEEDED': Failure(
         'Google asks for fewer requests', 'try again in a minute', temporary=True),
     **dict.fromkeys(('USER_RATE_LIMIT_EXCEEDED', 'RESOURCE_NOT_READY'), Failure(temporary=True)),
@@ -41,6 +43,9 @@ _FAILURES = {
     'RESOURCE_IN_USE_BY_ANOTHER_RESOURCE': Failure('', 'ros2 fog delete again in a minute'),
     'BACKEND_ERROR': Failure('', 'try again; https://status.cloud.google.com has what is known'),
 }
+#: Codes for refusals whose reason says little, by patterns of their messages.
+_KINDS = {'acceleratorType.*not (be )?found': 'NO_ACCELERATOR',
+          "/global/networks/[^']*' was not found": 'NO_NETWORK', r'\bconstraints/': 'POLICY'}
 
 
 class GoogleError(CodedError):
@@ -67,8 +72,8 @@ def refused(status: int, answer: Any, what: str) -> FogError:
         error, message, code = {}, f'Google answered with status {status}', ''
     if status == 401:
         code = 'AUTH_ERROR'
-    elif re.search('acceleratorType.*not (be )?found', message):
-        code = 'NO_ACCELERATOR'
+    elif kinds := [kind for pattern, kind in _KINDS.items() if re.search(pattern, message)]:
+        code = kinds[0]
     elif status == 404 and re.search(r"resource 'projects/[^/']+'", message):
         code = 'PROJECT_NOT_FOUND'
     elif status in (404, 429):
