@@ -198,6 +198,7 @@ def test_size_that_the_subscription_may_not_use_is_skipped(robot):
 
 def test_known_problems_are_named_before_creation(robot, monkeypatch):
     for options, words in (({'vm_size': 'Standard_X1'}, 'Azure has no Standard_X1'),
+                           ({'vm_size': 'Standard_DS2_v2', 'spot': True}, 'as a spot machine'),
                            ({'image': 'a:b:c:latest'}, 'no such image')):
         with pytest.raises(FogError, match=words):
             robot.create(**options)

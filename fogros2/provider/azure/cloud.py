@@ -134,10 +134,12 @@ class Azure(AzureImages, AzureDisks):
             guarded = pool.submit(ending.may_assign, self._account)
             subnet = pool.submit(self._subnet, options.resource_group, region)
             baked = pool.submit(self.baked, region, options, order.request.dependencies)
-            sizes = {name: listing.result()[name] for name in types if name in listing.result()}
+            sizes = {name: entry for name in types if (entry := listing.result().get(name))
+                     and (not options.spot or prices.machine_type(entry).spot)}
             if not sizes:
                 raise ConfigurationError(
-                    f'Azure has no {" or ".join(types)} in {region} for this subscription',
+                    f'Azure has no {" or ".join(types)} in {region} for this subscription'
+                    + ' as a spot machine' * options.spot,
                     'ros2 fog price --region shows what it has; confidential sizes need settings '
                     'that FogROS2 does not make')
             prepared = {}
