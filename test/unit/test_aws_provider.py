@@ -29,7 +29,7 @@ from fogros2.agent_client import agent_program
 from fogros2.deploy.steps import arming
 from fogros2.errors import ConfigurationError, MachineNotFound, PrerequisiteError, ProviderError
 from fogros2.model import CreateRequest, MachineSpec, MachineState
-from fogros2.provider.aws import clients, failures, instances, login, network
+from fogros2.provider.aws import clients, failures, instances, login, network, prices
 from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.provider import AWSProvider
@@ -195,6 +195,20 @@ def test_a_spot_machine_is_asked_for_once_and_with_its_cap():
         'SpotInstanceType': 'one-time', 'InstanceInterruptionBehavior': 'terminate',
         'MaxPrice': '0.5'}}
     assert words['TagSpecifications'][-1]['ResourceType'] == 'spot-instances-request'
+
+
+def test_type_with_part_of_a_gpu_needs_a_named_image(monkeypatch):
+    kind = prices.instance_type({
+        'InstanceType': 'g6f.large', 'ProcessorInfo': {'SupportedArchitectures': ['x86_64']},
+        'VCpuInfo': {'DefaultVCpus': 2}, 'MemoryInfo': {'SizeInMiB': 8192}, 'GpuInfo': {'Gpus': [{
+            'Name': 'L4', 'Manufacturer': 'NVIDIA', 'Count': 1, 'GpuPartitionSize': 0.125}]}})
+    assert kind.gpus == 0
+    with pytest.raises(ConfigurationError, match='only part of a GPU') as caught:
+        Ec2().image_for('eu-central-1', kind, Options.parse({}), 'abcd')
+    assert 'ami_image=' in caught.value.hint
+    monkeypatch.setattr(Ec2, '_named', lambda *words: IMAGE)
+    named = Options.parse({'ami_image': 'ami-1'})
+    assert Ec2().image_for('eu-central-1', kind, named, '') is IMAGE
 
 
 def test_tokens_differ_by_place_and_tell_nothing_of_the_request():

@@ -98,10 +98,10 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
 
     def prepare(self, region: str, order: Order, types: Sequence[str]) -> dict[str, Any]:
         """Return the image of each type, looked up once for all types that use the same."""
-        cache: dict[tuple[str, bool], Mapping[str, Any]] = {}
+        cache: dict[tuple[str, bool, bool], Mapping[str, Any]] = {}
         chosen: dict[str, Any] = {}
         for kind in self.named_types(region, types):
-            key = (kind.arch, images.has_nvidia(kind))
+            key = (kind.arch, images.has_nvidia(kind), bool(kind.gpus))
             if key not in cache:
                 cache[key] = self.image_for(region, kind, order.options,
                                             order.request.dependencies)

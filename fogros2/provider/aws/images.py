@@ -75,6 +75,10 @@ class Ec2Images(VmCloud):
         """
         if options.ami_image:
             return self._named(region, kind, options.ami_image)
+        if has_nvidia(kind) and not kind.gpus:
+            raise ConfigurationError(
+                f'{kind.name} has only part of a GPU, which takes another driver',
+                "ami_image= of an image with NVIDIA's GRID driver, or another ec2_instance_type=")
         baked = self._baked(region, kind, options, dependencies) if dependencies else None
         if baked is not None:
             return baked

@@ -97,7 +97,7 @@ def instance_type(entry: Mapping[str, Any]) -> Optional[MachineType]:
         int(threads.get('DefaultCores', threads['DefaultVCpus'])),
         entry['MemoryInfo']['SizeInMiB'] / 1024, arch,
         entry['ProcessorInfo'].get('Manufacturer', ''),
-        sum(int(gpu.get('Count', 1)) for gpu in gpus),
+        sum(int(gpu.get('Count', 1)) for gpu in gpus if gpu.get('GpuPartitionSize', 1) >= 1),
         f"{gpus[0].get('Manufacturer', '')} {gpus[0].get('Name', '')}".strip() if gpus else '',
         round(gpus[0].get('MemoryInfo', {}).get('SizeInMiB', 0) / 1024, 1) if gpus else 0.0,
         'spot' in entry.get('SupportedUsageClasses', []))
