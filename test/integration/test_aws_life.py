@@ -357,6 +357,16 @@ def test_reused_machine_follows_the_settings_of_its_launch(aws):
     assert behaviour() == 'stop'
 
 
+def test_kept_spot_machine_is_reused(aws):
+    spec, request = ask(on_exit='keep', spot=True)
+    machine_id = aws.provider.create(spec, request)
+    # EC2 refuses to change some attributes of spot instances; this one is 'terminate' anyway
+    aws.refuse('ModifyInstanceAttribute', 'UnsupportedOperation')
+    aws.provider.adopt(machine_id, spec, {'fogros2-launch': 'l2'})
+    assert aws.provider.describe(machine_id).tags['fogros2-launch'] == 'l2'
+    assert aws.sent == ['UnsupportedOperation']
+
+
 def test_a_group_in_use_is_deleted_as_soon_as_it_is_free(aws):
     machine_id = aws.provider.create(*ask())
     aws.refuse('DeleteSecurityGroup', 'DependencyViolation', 'DependencyViolation')

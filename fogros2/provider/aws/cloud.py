@@ -18,7 +18,7 @@ from fogros2.provider.aws.network import Ec2Network
 from fogros2.provider.aws.options import Options
 from fogros2.provider.aws.prices import Ec2Prices
 from fogros2.provider.vm.cloud import Order, Place, PRICES_AGE, Vm, VmId
-from fogros2.provider.vm.failures import settled, unless_gone
+from fogros2.provider.vm.failures import settled, tolerated, unless_gone
 from fogros2.provider.vm.regions import read_table, Regions
 
 
@@ -126,9 +126,11 @@ class Ec2(Ec2Prices, images.Ec2Images, Ec2Network, Ec2Disks):
                    Resources=[machine.vm], Tags=instances.tag_list(tags))
 
     def set_ending(self, machine: VmId, spec: MachineSpec) -> None:
-        self._call(machine, 'modify_instance_attribute', f'saying how {machine.vm} ends',
-                   InstanceId=machine.vm, Attribute='instanceInitiatedShutdownBehavior',
-                   Value=instances.at_shutdown(spec))
+        # EC2 may refuse that for a spot instance, which terminates in any case
+        with tolerated('UnsupportedOperation'):
+            self._call(machine, 'modify_instance_attribute', f'saying how {machine.vm} ends',
+                       InstanceId=machine.vm, Attribute='instanceInitiatedShutdownBehavior',
+                       Value=instances.at_shutdown(spec))
 
     def stop(self, machine: VmId) -> None:
         self._call(machine, 'stop_instances', f'stopping {machine.vm}', InstanceIds=[machine.vm])
