@@ -37,7 +37,8 @@ def test_full_zone_is_tried_once_for_each_type() -> None:
         raise CloudError('full', 'wait', full='zone')
 
     cloud: Any = SimpleNamespace(
-        title='Meadow', text_limit=0, find=lambda *_: [], begin=lambda *_: None, insert=insert,
+        title='Meadow', text_limit=0, boot='', find=lambda *_: [], begin=lambda *_: None,
+        insert=insert,
         prepare=lambda region, order, types: dict.fromkeys(types),
         places=lambda *_: ['a', 'b'],  # a list: an adapter need not write a generator
         undo_begin=lambda *_: [], end_attempt=lambda *_: False)

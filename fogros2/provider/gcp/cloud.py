@@ -55,6 +55,7 @@ class ComputeEngine(images.GoogleImages, GoogleFirewall, GoogleDisks):
     id_form = r'[a-z0-9.:-]+/[a-z0-9-]+/fogros2-[0-9a-f]{16}'
     base_region = DEFAULT_REGION
     types_age = PRICES_AGE
+    boot = guest.BOOT
     configured = staticmethod(login.configured)
 
     def __init__(self, account: Optional[Account] = None) -> None:

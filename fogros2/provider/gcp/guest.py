@@ -1,8 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands that run on an instance and use its metadata service: the notice, the end."""
+"""The commands that run on an instance: at its boot, for the notice, at its end."""
 
 from __future__ import annotations
 
+#: Google's guest agent would replace the host key of the user data at the first boot. Source:
+#: its instance_setup.go.
+BOOT = """\
+file=/etc/default/instance_configs.cfg
+grep -qs '^set_host_keys = false' $file ||
+    printf '\\n[InstanceSetup]\\nset_host_keys = false\\n' >>$file
+"""
 # A socket is used, because an HTTP library takes five times as long to load as this takes to run.
 _ASK = """\
 import os, socket, sys

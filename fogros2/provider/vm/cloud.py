@@ -226,6 +226,8 @@ class VmCloud(abc.ABC):
     base_region: ClassVar[str]
     #: The most characters of user data that has to be text; 0 where a cloud takes any bytes.
     text_limit: ClassVar[int] = 0
+    #: A shell script that each machine runs at each boot, before its SSH server and agent.
+    boot: ClassVar[str] = ''
     #: The usual price of a GB of a volume in US dollars a month, None without volumes.
     gb_month: ClassVar[Optional[Decimal]] = None
     #: Seconds for which ``types`` and ``zones`` are used again. They are few, because a type that

@@ -131,7 +131,8 @@ class Creation:
         return user_data(cloud_config(
             name=self.spec.name, user=options.user,
             authorized_keys=[self.request.authorized_key, *options.fleet],
-            host_key=one_time(self.request.token), agent_config=agent), self.cloud.text_limit)
+            host_key=one_time(self.request.token), agent_config=agent,
+            boot=self.cloud.boot), self.cloud.text_limit)
 
     def _make(self, region: str, order: Order, prepared: Mapping[str, Any]) -> VmId:
         created: list[str] = []

@@ -123,12 +123,13 @@ def user_data(config: Mapping[str, Any], text_limit: int = 0) -> bytes:
 
 def cloud_config(
     *, name: str, user: str, authorized_keys: Sequence[str], host_key: HostKey,
-    agent_config: Mapping[str, Any],
+    agent_config: Mapping[str, Any], boot: str = '',
 ) -> dict[str, Any]:
     """
     Return a machine's #cloud-config as a dictionary.
 
     :param agent_config: the agent's configuration; empty for a machine without an agent.
+    :param boot: a shell script of the cloud, for each boot.
     """
     config: dict[str, Any] = {
         'hostname': name,
@@ -142,13 +143,16 @@ def cloud_config(
         'package_upgrade': False,
         'runcmd': [['sh', '-c', _TOOLS]],
     }
+    scripts = [boot] if boot else []
     if agent_config:
         armed = {'user': user, 'kept_until': f'{FOLDER}/kept_until', **agent_config}
         armed['end_command'] = armed.get('end_command') or list(END_COMMAND)
         names = {'user': user, 'folder': FOLDER, 'program': AGENT_PROGRAM, 'log': LOG,
                  'unguarded': UNGUARDED, 'end': shlex.join(armed['end_command']),
                  'boot_timeout': round(armed.get('boot_timeout', 1800.0))}
-        config['bootcmd'] = [['sh', '-c', _BOOT.format(
+        scripts.append(_BOOT.format(
             watchdog=_WATCHDOG.format(**names), mark='FOGROS2-END',
-            config=json.dumps(armed), **names)]]
+            config=json.dumps(armed), **names))
+    if scripts:
+        config['bootcmd'] = [['sh', '-c', script] for script in scripts]
     return config

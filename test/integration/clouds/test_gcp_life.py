@@ -36,6 +36,14 @@ def test_denial_keeps_out_whom_google_admits(provider, robot, box, make, name):
         provider.destroy(machine.id)
 
 
+def test_pinned_host_key_stays_beside_the_guest_agent(provider, box, make, name):
+    machine = make(name)
+    (instance,) = box.alive()
+    shown = box.run(instance.id, 'cat /etc/ssh/ssh_host_ed25519_key.pub')
+    assert shown.split()[:2] == machine.endpoint.host_key.split()
+    provider.destroy(machine.id)
+
+
 @pytest.mark.parametrize('account', ['', SERVICE_ACCOUNT])
 def test_machine_ends_itself_as_its_rights_allow(cloud, provider, box, make, name, account):
     machine = make(name, service_account=account)

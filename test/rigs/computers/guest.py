@@ -86,6 +86,14 @@ def host_keys(plan: Mapping[str, Any]) -> None:
              '-f', '/etc/ssh/ssh_host_ed25519_key'])
 
 
+def google_guest_agent() -> None:
+    """Make other host keys, unless the agent's configuration says otherwise."""
+    with contextlib.suppress(FileNotFoundError), open('/etc/default/instance_configs.cfg') as file:
+        if '[InstanceSetup]\nset_host_keys = false\n' in file.read():
+            return
+    host_keys({'ssh_keys': {}})
+
+
 def first_stage(plan: Mapping[str, Any], new: bool) -> None:
     """Do what comes before sshd."""
     for command in plan['bootcmd']:
@@ -95,6 +103,8 @@ def first_stage(plan: Mapping[str, Any], new: bool) -> None:
     if plan['hostname']:
         write('/etc/hostname', plan['hostname'].encode() + b'\n')
     host_keys(plan)
+    if plan.get('google'):
+        google_guest_agent()
     authorize(plan['user'], [*plan['keys'], *plan['ssh_authorized_keys']])
 
 

@@ -40,7 +40,7 @@ class Cloud(cloud.Cloud):
     def plan(self, machine: Machine) -> dict[str, Any]:
         """Return what the user data says."""
         return {**cloud_config.parse(self.user_data(machine)), 'instance': machine.id,
-                'user': USER, 'keys': []}
+                'user': USER, 'keys': [], 'google': True}
 
     def network_of(self, machine: Machine) -> str:
         """Return the VPC network."""
