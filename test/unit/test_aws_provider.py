@@ -473,7 +473,7 @@ def test_the_agent_is_armed_before_anything_else_runs():
     script, = (words[2] for words in told['bootcmd'])
     assert '"end_command": ["shutdown", "-h", "now"]' in script
     assert '"user": "ubuntu"' in script
-    assert '--property=Restart=always' in script
+    assert '--property=Restart=always --property=OOMPolicy=continue' in script
     assert 'apt' not in script
     assert told['ssh_keys']['ed25519_public'].split() == one_time(TOKEN).public.split()
     assert 'bootcmd' not in config()

@@ -83,9 +83,10 @@ echo '$nrconf{{override_rc}}{{qr(^fogros2-agent)}} = 0;' >/etc/needrestart/conf.
 # logind would remove the user's shared memory and runtime folder after the last logout
 mkdir -p /var/lib/systemd/linger
 touch /var/lib/systemd/linger/{user}
-# a unit of its own: it must not end with this step of the boot
+# a unit of its own: it must not end with this step of the boot, nor with a node without memory
 systemd-run --no-block --unit=fogros2-agent --property=DefaultDependencies=no \\
-    --property=Restart=always /bin/sh {folder}/watchdog.sh >/dev/null 2>&1 \\
+    --property=Restart=always --property=OOMPolicy=continue \\
+    /bin/sh {folder}/watchdog.sh >/dev/null 2>&1 \\
     || setsid /bin/sh {folder}/watchdog.sh &
 """
 
