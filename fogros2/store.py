@@ -421,7 +421,8 @@ def robot_id(*, new: bool = True) -> str:
     Return this robot's id in tags: its name, and random digits that belong to this computer.
 
     The digits are in the file ``robot.json`` of the configuration folder, by the computer's
-    machine-id and one MAC address. Another computer with the file, or a copy of it, adds its own.
+    machine-id and one MAC address; in WSL 2, by the machine-id. Another computer with the file,
+    or a copy of it, adds its own.
 
     :param new: make digits if there are none; else return the name alone.
     :raises StoreError: the file can't be written.
@@ -464,7 +465,8 @@ def _digits(folder: Path, *, new: bool) -> str:
         _make_folders(folder)
     machine = Path('/etc/machine-id')
     machine_id = machine.read_text().strip() if machine.exists() else ''
-    addresses = mac_addresses()
+    # WSL 2 gives its only network card another address at each start
+    addresses = [] if 'microsoft' in os.uname().release else mac_addresses()
     with open(folder / 'robot.json', 'a+' if new else 'r',
               opener=lambda path, flags: os.open(path, flags, 0o600)) as file:
         fcntl.flock(file, fcntl.LOCK_EX if new else fcntl.LOCK_SH)
