@@ -305,8 +305,10 @@ def _confine(
     The parent of an agent, which has the same command line, is in the group, too: it starts
     another agent when that one dies.
 
-    The group is a child of the group of the process, so that limits and systemd's units stay. The
-    step prints a line and does not fail where control groups (version 2) cannot be used.
+    The group is a child of the group of the process, so that limits and systemd's units stay. A
+    launch that a node of another one started gets its group beside the other's, whose filter knows
+    one VPN only. The step prints a line and does not fail where control groups (version 2) cannot
+    be used.
 
     Other users can make control groups, with any name, in a group that is theirs. So the undo
     removes only the group whose path the step wrote into a file of root's. Another launch of the
@@ -368,11 +370,15 @@ confine() {{
   read -r kept 2>/dev/null <{record} || kept=none
   case $top$group/ in
     "$kept"/*) group=${{kept#"$top"}};;
-    *) end_groups; group=${{group%/{name}}}; group=${{group%/}}/{name};;
+    *) end_groups; group=${{group%/{name}}}
+       while [ "$(sed 1d "/run/${{group##*/}}.group" 2>/dev/null || echo $pid)" != $pid ]; do
+         group=${{group%/*}}
+       done
+       group=${{group%/}}/{name};;
   esac
   case $group in *[!-A-Za-z0-9/_.@:\\\\]* | */..*) echo "odd name: $group"; return 1;; esac
   [ "$kept" = "$top$group" ] || {{
-    printf "%s\\n" "$top$group" >{record}
+    printf "%s\\n" "$top$group" "$pid" >{record}
     mkdir -p "$top$group" || return
     [ -z "$parent" ] || echo "$parent" >"$top$group/cgroup.procs" || return
     echo "$pid" >"$top$group/cgroup.procs" || return

@@ -14,6 +14,7 @@ import os
 from pathlib import Path
 import secrets
 import subprocess
+import sys
 
 import pytest
 
@@ -30,6 +31,12 @@ TOP = next((path for path in (Path('/sys/fs/cgroup'), Path('/sys/fs/cgroup/unifi
 #: `ip netns exec` hides the control groups.
 ENTER = 'mount -t cgroup2 cgroup2 /sys/fs/cgroup; exec "$@"'
 VPN = WireGuard(CycloneDds().ports)
+#: Send a message of DDS into the VPN of the robot with this address.
+SEND = """
+import ipaddress, socket
+address = str(ipaddress.ip_address('{}') + 1)
+socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'RTPS' + bytes(40), (address, 7410))
+"""
 
 
 def sudo(*words: str, check: bool = True) -> str:
@@ -142,6 +149,30 @@ def test_last_of_two_launches_removes_both_groups(
             do(space, command)
         assert group_of(pid) == groups
         assert not [path for path in groups.iterdir() if path.is_dir()]
+    for each in (outer, inner):
+        assert not list(Path('/run').glob(f'{each.name}*'))
+
+
+def test_launch_below_another_one_reaches_its_own_machines(
+        groups: Path, space: str, tmp_path: Path) -> None:
+    sudo('ip', '-n', space, 'link', 'set', 'lo', 'up')
+    with launch(groups) as pid, launch(groups) as below:
+        outer, inner = interface(tmp_path, 7, pid), interface(tmp_path, 8, below)
+        for each in (outer, inner):
+            write(str(below), group_of(pid) / 'cgroup.procs')
+            for command in (VPN.keys(each), *VPN.up(each, [])):
+                do(space, command)
+        for each, own in ((outer, pid), (inner, below)):
+            for command in VPN.repair(each, []):
+                do(space, command)
+            assert group_of(own) == groups / each.name
+            sudo('sh', '-c', 'echo $$ >"$1/cgroup.procs"; exec ip netns exec "$2" "$3" -c "$4"',
+                 'sh', str(group_of(own)), space, sys.executable, SEND.format(each.address))
+        for each in (outer, inner):
+            for command in VPN.down(each):
+                do(space, command)
+        assert group_of(pid) == group_of(below) == groups
+    assert not [path for path in groups.iterdir() if path.is_dir()]
     for each in (outer, inner):
         assert not list(Path('/run').glob(f'{each.name}*'))
 
