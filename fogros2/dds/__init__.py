@@ -7,6 +7,7 @@ import abc
 from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
+import math
 import socket
 from types import MappingProxyType
 from typing import ClassVar, Optional
@@ -57,6 +58,8 @@ class DdsVendor(abc.ABC):
     by_address: ClassVar[bool] = False
     #: Whether the robot's nodes announce themselves to each machine's address, too.
     asks_machines: ClassVar[bool] = False
+    #: The number of a machine's processes that those of another machine always discover.
+    asked_processes: ClassVar[float] = math.inf
     #: Name of the configuration file; some middlewares require a suffix.
     file_name: ClassVar[str] = 'dds.xml'
     #: The last domain for which DDS has ports. Domains above 101 use Linux's ephemeral ports.

@@ -38,7 +38,8 @@ from fogros2.vpn.addresses import dds_ports
 MAX_PARTICIPANTS = 119
 #: Number of processes that a peer is asked for. Each participant asks each of their ports in each
 #: interval, whether or not a process uses the port. An asked process answers, so only two
-#: processes that both have higher numbers on their hosts do not find each other.
+#: processes that both have higher numbers on their hosts do not find each other. With
+#: 32 ports, two idle machines with 3 processes each exchange 31 kB/s instead of 11.
 ASKED = 10
 #: Seconds between announcements of a participant: how soon a host is found again after its lease
 #: ended in a long interruption, or its first announcement was lost. Fifty processes send 210 kB/s.
@@ -84,6 +85,7 @@ class CycloneDds(DdsVendor):
     """
 
     rmw: ClassVar[str] = 'rmw_cyclonedds_cpp'
+    asked_processes: ClassVar[float] = ASKED
 
     def asked(self, user: Mapping[str, str]) -> list[str]:
         """Return the hosts of ROS_STATIC_PEERS, and those of each ``<Peer>``."""

@@ -131,6 +131,7 @@ class Launch:
         rmw = self.dds().rmw
         check_robot()
         self._nodes.update(nodes)
+        self._warn_of_crowds()
         check_names(specs)
         plan.check_rmw(rmw, plan.ament_prefixes(self.user_environment), specs)
         plan.check_domain(self.domain, specs)
@@ -156,6 +157,16 @@ class Launch:
                 f"the launch has {len(names)} machines, and the robot's router can have "
                 f'{robot_router.MACHINES}',
                 'use several launches, or another RMW_IMPLEMENTATION')
+
+    def _warn_of_crowds(self) -> None:
+        """Warn if machines have more processes than those of other machines discover."""
+        limit = self.dds().asked_processes
+        crowded = sorted(name for name, nodes in self._nodes.items() if len(nodes) > limit)
+        if len(crowded) > 1:
+            self.report(Warned(
+                '', f"{', '.join(crowded)} run more than {limit} processes each: with "
+                f'{self.dds().rmw}, further ones of two machines may not discover each other',
+                'use another RMW_IMPLEMENTATION, or several nodes in one process (components)'))
 
     def _choose(self, spec: MachineSpec) -> Optional[MachineSpec]:
         """Make the open choices of a spec; return it unless a kept machine may fit."""

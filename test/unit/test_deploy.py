@@ -61,7 +61,7 @@ from fogros2.model import (
     Peer,
     Result,
 )
-from fogros2.report import Silence, StepDone, StepFailed
+from fogros2.report import Silence, StepDone, StepFailed, Warned
 from fogros2.shell import host_key
 from fogros2.store import Made, process_start, Store
 from fogros2.vpn import addresses, STAYS
@@ -150,6 +150,22 @@ def test_machines_that_no_node_would_hear_are_not_created(
     assert checked.calls == []
     launch.prepare([dataclasses.replace(SPEC, name=f'm{n}', environment=robot)
                     for n in range(32)])
+
+
+@pytest.mark.parametrize(('dds', 'counts', 'crowded'), [
+    ('cyclonedds', [11, 10, 12], ['m0, m2']), ('cyclonedds', [11, 10, 10], []),
+    ('fastdds', [11, 11, 12], [])])
+def test_warning_of_processes_that_would_not_meet(
+        launch, checked, events, monkeypatch, dds, counts, crowded):
+    monkeypatch.setattr(deployed, 'check_robot', lambda: None)
+    monkeypatch.setattr(plan, 'check_rmw', lambda *_: None)
+    checked.has_own_packages = lambda spec: True
+    launch.use_dds(dds)
+    for number, count in enumerate(counts):  # as machines whose nodes come later
+        launch.prepare([dataclasses.replace(SPEC, name=f'm{number}')], {
+            f'm{number}': [NodeSpec(f'n{n}', 'n', 'demo', 'talker') for n in range(count)]})
+    assert [event.text.partition(' run more than 10')[0] for event in events
+            if isinstance(event, Warned) and 'discover' in event.text] == crowded
 
 
 @pytest.mark.parametrize(('dds', 'environment', 'drops'), [
