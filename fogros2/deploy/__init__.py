@@ -22,6 +22,7 @@ Each step pushes its undo before it runs. The modules, each imports only those b
 
 from fogros2.deploy.launch import Launch
 from fogros2.deploy.robot import (
+    check_net_admin,
     check_robot,
     check_sudo,
     kernel_wireguard,
@@ -33,6 +34,6 @@ from fogros2.deploy.robot import (
 from fogros2.deploy.running import RunningMachine
 
 __all__ = [
-    'check_robot', 'check_sudo', 'kernel_wireguard', 'Launch', 'provider', 'ROBOT_PROGRAMS',
-    'RunningMachine', 'TUN', 'TUN_REMEDY',
+    'check_net_admin', 'check_robot', 'check_sudo', 'kernel_wireguard', 'Launch', 'provider',
+    'ROBOT_PROGRAMS', 'RunningMachine', 'TUN', 'TUN_REMEDY',
 ]

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 import os
 from pathlib import Path
+import re
 import threading
 from typing import Optional
 
@@ -57,11 +58,24 @@ def check_robot() -> None:
     :raises PrerequisiteError: a program, a right or a device is missing.
     """
     process.require(list(ROBOT_PROGRAMS), package_of=ROBOT_PROGRAMS)
+    check_net_admin()
     if not TUN.exists() and not kernel_wireguard():
         raise PrerequisiteError(f'{TUN} is missing on this computer', TUN_REMEDY)
     if os.geteuid() != 0 and not helped.permitted():
         with _ASKING:
             check_sudo(ask=True)
+
+
+def check_net_admin() -> None:
+    """
+    Check that root has the right to create network interfaces, which containers lack.
+
+    :raises PrerequisiteError: root has not.
+    """
+    rights = re.search(r'^CapBnd:\s*(\w+)', Path('/proc/self/status').read_text(), re.MULTILINE)
+    if rights is not None and not int(rights[1], 16) & 1 << 12:  # <linux/capability.h>
+        raise PrerequisiteError('a VPN interface needs NET_ADMIN, which this container lacks',
+                                f'start the container with --cap-add NET_ADMIN --device {TUN}')
 
 
 def kernel_wireguard() -> bool:

@@ -212,6 +212,7 @@ def overlay() -> Check:
 def firewall_program() -> Check:
     """Check whether nftables accepts rules; the launch filters the robot's side of the VPN."""
     try:
+        deploy.check_net_admin()
         process.run(Command(('nft', 'list', 'tables'), sudo=True, what='ask nftables'),
                     timeout=10.0)
     except FogError as error:

@@ -388,6 +388,17 @@ def test_kernel_with_wireguard_needs_no_tun(
         robot.check_robot()
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root can give up a right')
+def test_container_without_net_admin_is_refused_at_once() -> None:
+    text = ('from fogros2.deploy import check_robot; from ros2fog_cli.api import doctor\n'
+            'print(doctor.firewall_program()); check_robot()')
+    child = subprocess.run(['setpriv', '--bounding-set=-net_admin', sys.executable, '-c', text],
+                           capture_output=True, text=True)
+    remedy = f'start the container with --cap-add NET_ADMIN --device {robot.TUN}'
+    assert remedy in child.stdout and 'modprobe' not in child.stdout
+    assert 'needs NET_ADMIN' in child.stderr and remedy in child.stderr
+
+
 def test_user_outside_of_the_group_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, 'which', lambda program: f'/usr/bin/{program}')
     monkeypatch.setattr(process, 'sudo_trouble', lambda: process.PASSWORD)
