@@ -338,7 +338,7 @@ class Store:
         :param cancel: a launch's, which waits for a verb to end, not for another launch.
         :raises NameTaken: another process holds the lock.
         :raises Cancelled: the launch ends.
-        :raises StoreError: the disk is full, or the folder is not writable.
+        :raises StoreError: the folder is not writable.
         """
         # beside the folder: deleting the folder must not release the lock early
         path = self.machine(name).with_name(f'.{name}.lock')
@@ -346,14 +346,14 @@ class Store:
         with contextlib.ExitStack() as undo:
             while True:
                 try:
-                    handle = undo.enter_context(open(path, 'a+'))
+                    handle = undo.enter_context(open(path, 'a+b', buffering=0))
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     handle.truncate(0)
-                    handle.write('command' if cancel is None else 'launch')
-                    handle.flush()
+                    with contextlib.suppress(OSError):  # a full disk prevents no deletion
+                        handle.write(b'command' if cancel is None else b'launch')
                 except BlockingIOError:
                     handle.seek(0)
-                    holder = handle.read()
+                    holder = handle.read().decode()
                     handle.close()
                     if cancel is None or holder != 'command':
                         raise NameTaken(

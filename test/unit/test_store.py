@@ -9,6 +9,7 @@ import operator
 import os
 from pathlib import Path
 import re
+import resource
 import stat
 import subprocess
 import sys
@@ -152,6 +153,18 @@ def test_a_name_that_cannot_be_held_is_a_clear_error(store, monkeypatch):
     with pytest.raises(StoreError, match='No space left'):
         with store.lock('planner'):
             pass
+
+
+def test_name_is_held_while_no_file_can_grow(store):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+    try:
+        with store.lock('planner'):
+            with pytest.raises(NameTaken, match='another launch'):
+                with store.lock('planner'):
+                    pass
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_a_killed_holder_frees_the_name(store):
