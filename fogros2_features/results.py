@@ -10,6 +10,7 @@ import itertools
 import os
 from pathlib import Path
 import re
+import shutil
 import time
 from typing import Optional, TYPE_CHECKING
 
@@ -41,6 +42,8 @@ TIMEOUT, ATTEMPTS = 900.0, 3
 SLOWEST = 10e3
 #: Bytes that a folder may take on the disk beyond its limit: each small file has a block.
 SLACK = 100e6
+#: Bytes, or half of what is free, that no copy takes from the robot's disk.
+SPARE = 1e9
 #: Where a machine, by its name, keeps recordings until they come home, and the name of the folder.
 RECORDINGS, RECORDED = '~/fogros2-{}', 'recordings'
 _UNITS = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9, 'T': 1e12}
@@ -143,12 +146,17 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
             f'fetch_limit={own.limit / 1e9:.3g} GB: they did not come home',
             'raise fetch_limit=, or write less')
     home = own.target / f'{running.spec.name}-{time.strftime("%Y%m%d-%H%M%S")}'
-    done, failures = [], []
+    done, failures, large = list[str](), list[FogError](), list[str]()
     if sizes:
         _make(check_owner(own.target))
         home = _make(home, number=1)
         done.append(f'{total / 1e6:.3g} MB to {home}')
-    for folder, target in _targets(home, sizes).items():
+    # the small ones first, which may fit where a large one does not
+    for folder, target in sorted(_targets(home, sizes).items(), key=lambda one: sizes[one[0]]):
+        free = shutil.disk_usage(home).free
+        if sizes[folder] > max(free - SPARE, free / 2):
+            large.append(folder)
+            continue
         try:
             # a folder may grow meanwhile, and many small files take more than their sizes
             _copy(running, folder, target, size=sizes[folder],
@@ -157,6 +165,12 @@ def _bring(running: RunningMachine, own: Wanted) -> str:
             failures.append(error)
             if isinstance(error, ConnectError):
                 break  # the others would wait for the same machine
+    if large:
+        failures.append(ShellError(
+            f"{', '.join(large)} of '{running.spec.name}' did not come home: "
+            f'{sum(map(sizes.__getitem__, large)) / 1e9:.3g} GB are too much for the disk of '
+            f'{own.target}, which has {free / 1e9:.3g} GB free',
+            'free some space, or name a folder of a larger disk in fetch_to='))
     if failures:
         raise failures[0]
     if missing:

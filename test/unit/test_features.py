@@ -8,6 +8,7 @@ import inspect
 import io
 import os
 from pathlib import Path
+import shutil
 import time
 from types import SimpleNamespace
 from typing import Any, Optional, TYPE_CHECKING
@@ -291,6 +292,22 @@ def test_too_large_folders_do_not_come_home(home: Path) -> None:
     with pytest.raises(ShellError, match=r'~/bags of .a. have 0.0002\d* GB, more than'):
         brought(FakeRunning(), fetch=['~/bags'], fetch_limit='100kB')
     assert not (home / 'fogros2').exists()
+
+
+def test_folder_without_room_on_the_robot_keeps_no_other(
+    home: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, size in (('huge', 900_000), ('bags', 200_000), ('maps', 3)):
+        (home / name).mkdir()
+        (home / name / 'one').write_text('x' * size)
+    monkeypatch.setattr(results, 'SPARE', 300_000.0)
+    monkeypatch.setattr(shutil, 'disk_usage', lambda path: SimpleNamespace(
+        free=400_000.0 - sum(file.stat().st_size for file in Path(path).rglob('*/one'))))
+    with pytest.raises(ShellError, match='^~/bags, ~/huge of .a. did not come home') as caught:
+        brought(FakeRunning(), fetch=['~/huge', '~/bags', '~/maps'])
+    assert 'fetch_to=' in caught.value.hint
+    assert [path.read_text() for path in home.glob('fogros2/*/*/one')] == ['xxx']
+    assert not [*home.glob('fogros2/*/huge')]
 
 
 def test_many_small_files_come_home(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
