@@ -267,9 +267,11 @@ def _file_of(data: bytes) -> BinaryIO:
     """
     Return a file in memory with this content; unlike a pipe, it needs no thread that writes.
 
-    Not ``os.memfd_create``, which a Python built for an old libc, such as conda's, does not have.
+    ``/dev/shm`` may be full or missing. But a Python built for an old libc, such as conda's, has
+    no ``os.memfd_create``.
     """
-    file = tempfile.TemporaryFile(dir='/dev/shm')
+    file = os.fdopen(os.memfd_create('input'), 'w+b') if hasattr(os, 'memfd_create') \
+        else tempfile.TemporaryFile(dir='/dev/shm')
     file.write(data)
     file.seek(0)
     return file

@@ -90,6 +90,15 @@ def test_a_program_that_cannot_be_started_is_one_clear_error(monkeypatch):
         process.run(Command(('true',)), timeout=5.0)
 
 
+@pytest.mark.parametrize('missing', ['tempfile.TemporaryFile', 'os.memfd_create'])
+def test_input_needs_one_of_two_kinds_of_memory(
+        monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+    """``/dev/shm`` may be full or missing, and a Python may have no ``memfd_create``."""
+    monkeypatch.delattr(missing)
+    data = os.urandom(100_000).hex()
+    assert process.run(Command(('cat',), input=data.encode()), timeout=20.0).stdout == data
+
+
 @pytest.mark.parametrize(('said', 'reason', 'hint'), [
     (['sudo: a password is required', 'sudo: a password is required'],
      'sudo wants a password', 'run `sudo -v` first, or allow it without a password'),
