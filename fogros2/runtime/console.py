@@ -68,7 +68,7 @@ class Screen:
 
     def isatty(self) -> bool:
         """Return whether the stream is a terminal."""
-        return self.stream.isatty()
+        return not self.stream.closed and self.stream.isatty()
 
     def drain(self) -> bool:
         """Return whether all texts are written, at the latest after a second."""
@@ -116,7 +116,7 @@ class Console:
         self._logger.addFilter(_cleaned)
         self._handler = launch.logging.launch_config.get_screen_handler()
         self._stream = Screen(stream or self._handler.stream)
-        self._handler.setStream(self._stream)
+        self._handler.stream = self._stream  # setStream fails where the former one is closed
         self._lock = threading.RLock()
         self._running: dict[tuple[str, str], _Running] = {}
         self._drawn = False

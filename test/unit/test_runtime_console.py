@@ -208,6 +208,16 @@ def test_dead_screen_neither_fails_nor_blocks(lines, how):
         os.close(reader)  # frees the thread
 
 
+def test_closed_stream_of_an_earlier_test_ends_no_launch(lines, monkeypatch):
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr(launch.logging.launch_config.get_screen_handler(), 'stream', closed)
+    console = Console()
+    console(StepDone('planner', 'sync', 1.0))
+    console.close()
+    assert lines == [('INFO', 'planner: sync 1.00 s')]
+
+
 def test_screen_keeps_the_order_and_what_a_locale_lacks(capfd):
     reader, writer = os.pipe()
     with os.fdopen(writer, 'w', encoding='ascii') as stream:
