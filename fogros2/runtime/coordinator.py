@@ -20,6 +20,7 @@ import os
 from pathlib import Path
 import threading
 from typing import Any, Optional, TYPE_CHECKING, Union
+import weakref
 
 from launch import Action, Event, EventHandler, LaunchContext
 from launch.actions import (
@@ -69,6 +70,8 @@ _LOCAL = 'fogros2'
 _EARLY = 'set it at the beginning of the launch file, outside of groups'
 #: More than any launch has machines: each may block a thread.
 _THREADS = 128
+#: Coordinators of this process whose launches have not ended.
+_ENGAGED: weakref.WeakSet[Coordinator] = weakref.WeakSet()
 
 
 class Begin(Event):
@@ -170,10 +173,15 @@ class Coordinator:
 
         :param planned: what is checked before the VPN interface, which may need a password.
         :raises FogError: the environment is unavailable, as for an unknown RMW_IMPLEMENTATION; or
-            this computer lacks something.
+            this computer lacks something; or another launch of this process has machines.
         """
         if self._launch is not None:
             return
+        # they would share the terminal, the signals, and the control group that the VPN filters
+        if any(other._launch is not None for other in _ENGAGED):
+            raise ConfigurationError('another launch of this process has machines already',
+                                     'start each launch with machines in a process of its own')
+        _ENGAGED.add(self)
         self._check_overrides(early=True)
         context = self._context
         defaults.check(context.environment)
@@ -597,6 +605,7 @@ class Coordinator:
             self._logger.info(line)
 
     def _taken_down(self, task: asyncio.Task[None]) -> None:
+        _ENGAGED.discard(self)
         self._restore_environment()
         self._raise_in_launch(task)
         if self._console is not None:

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import os
 import threading
 
-from launch import LaunchDescription
+from launch import LaunchContext, LaunchDescription
 from launch.actions import (
     AppendEnvironmentVariable,
     EmitEvent,
@@ -49,6 +49,7 @@ from fogros2.errors import (
 from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
 from fogros2.runtime import remote_run, session
+from fogros2.runtime.coordinator import Coordinator
 from fogros2.waiting import wait_until
 from rigs.launching import ends
 from ros2fog_cli.api.preview import Preview
@@ -84,6 +85,21 @@ def test_launch_leaves_the_environment_unchanged(run, fake, planner, monkeypatch
         talker(planner), OpaqueFunction(function=lambda context: during.append(
             context.environment['CYCLONEDDS_URI']))])) == 0
     assert during == ['<CycloneDDS/>'] and dict(os.environ) == before
+
+
+def test_second_launch_in_a_process_that_has_one_is_refused(run, fake, planner):
+    fake.on_start = ends
+    errors = []
+
+    def second(context):
+        try:
+            Coordinator(LaunchContext(), make_launch=fake).engage()
+        except ConfigurationError as error:
+            errors.append(str(error.args[0]))
+
+    for number in (1, 2):
+        assert run(LaunchDescription([talker(planner), OpaqueFunction(function=second)])) == 0
+        assert errors == number * ['another launch of this process has machines already']
 
 
 # -- up ------------------------------------------------------------------------------------------
