@@ -305,17 +305,16 @@ def _confine(
     The parent of an agent, which has the same command line, is in the group, too: it starts
     another agent when that one dies.
 
-    The group is a child of the group of the process, so that limits and systemd's units stay. A
-    launch that a node of another one started gets its group beside the other's, whose filter knows
-    one VPN only. The step prints a line and does not fail where control groups (version 2) cannot
-    be used.
+    The group is a child of the group of the process, so that limits and systemd's units stay; but
+    not of another launch's group, whose filter knows one VPN only. The step prints a line and does
+    not fail where control groups (version 2) cannot be used.
 
     Other users can make control groups, with any name, in a group that is theirs. So the undo
-    removes only the group whose path the step wrote into a file of root's. Another launch of the
-    same process has its group below: the last launch removes the groups of those that ended.
+    removes only the group whose path the step wrote into a file of root's. A group with groups
+    below it, such as a container engine's, stays.
     """
     name = _name(interface)
-    record, owed = f'/run/{name}.group', f'/run/{name}.owed'
+    record = f'/run/{name}.group'
     group = addresses.multicast_group(interface.address)
     match = f'{RTPS} socket cgroupv2 level %s "%s"'
     if interface.firewall:
@@ -351,14 +350,10 @@ empty_group() {{
     done 2>/dev/null
   done
 }}
-end_groups() {{
-  [ ! -e {record} ] || mv {record} {owed}
-  read -r own 2>/dev/null <{owed} || return 0
-  while grep -qsxF "$own" "/run/${{own##*/}}.owed"; do
-    [ ! -O "$own" ] || [ -z "$(find "$own" -mindepth 1 -type d)" ] || return 0
-    empty_group "$own" && rm -f "/run/${{own##*/}}.owed" || return
-    own=${{own%/*}}
-  done
+end_group() {{
+  read -r own 2>/dev/null <{record} || return 0
+  [ ! -O "$own" ] || [ -z "$(find "$own" -mindepth 1 -type d)" ] || return 0
+  empty_group "$own" && rm -f {record}
 }}"""
     # the name of the group enters the rules
     do = f"""\
@@ -370,15 +365,13 @@ confine() {{
   read -r kept 2>/dev/null <{record} || kept=none
   case $top$group/ in
     "$kept"/*) group=${{kept#"$top"}};;
-    *) end_groups; group=${{group%/{name}}}
-       while [ "$(sed 1d "/run/${{group##*/}}.group" 2>/dev/null || echo $pid)" != $pid ]; do
-         group=${{group%/*}}
-       done
+    *) end_group; group=${{group%/{name}}}
+       while grep -qsxF "$top$group" "/run/${{group##*/}}.group"; do group=${{group%/*}}; done
        group=${{group%/}}/{name};;
   esac
   case $group in *[!-A-Za-z0-9/_.@:\\\\]* | */..*) echo "odd name: $group"; return 1;; esac
   [ "$kept" = "$top$group" ] || {{
-    printf "%s\\n" "$top$group" "$pid" >{record}
+    printf "%s\\n" "$top$group" >{record}
     mkdir -p "$top$group" || return
     [ -z "$parent" ] || echo "$parent" >"$top$group/cgroup.procs" || return
     echo "$pid" >"$top$group/cgroup.procs" || return
@@ -387,7 +380,7 @@ confine() {{
   printf {text} "$(($(printf %s "$group" | tr -cd / | wc -c)))" "${{path#/}}" | nft -f -
 }}
 said=$(confine 2>&1) || echo "no control group for process {process}: $said" """
-    return _Step(do, f'{ends}\nend_groups')
+    return _Step(do, f'{ends}\nend_group')
 
 
 def _outside(interface: VpnInterface) -> str:

@@ -125,34 +125,6 @@ def test_group_s_name_leads_root_to_no_file(groups: Path, space: str, tmp_path: 
     assert victim.read_text() == ''
 
 
-@pytest.mark.parametrize('first', ['outer', 'inner'])
-def test_last_of_two_launches_removes_both_groups(
-        groups: Path, space: str, tmp_path: Path, first: str) -> None:
-    with launch(groups) as pid:
-        outer, inner = interface(tmp_path, 7, pid), interface(tmp_path, 8, pid)
-        for each in (outer, inner):
-            do(space, VPN.keys(each))
-            for command in VPN.up(each, []):
-                do(space, command)
-        below = groups / outer.name / inner.name
-        assert group_of(pid) == below
-        # what a launch repairs stays where it is
-        for each in (inner, outer):
-            for command in VPN.repair(each, []):
-                do(space, command)
-        assert group_of(pid) == below
-        ends = [outer, inner] if first == 'outer' else [inner, outer]
-        for command in VPN.down(ends[0]):
-            do(space, command)
-        assert group_of(pid) == (below if first == 'outer' else below.parent)
-        for command in VPN.down(ends[1]):
-            do(space, command)
-        assert group_of(pid) == groups
-        assert not [path for path in groups.iterdir() if path.is_dir()]
-    for each in (outer, inner):
-        assert not list(Path('/run').glob(f'{each.name}*'))
-
-
 def test_launch_below_another_one_reaches_its_own_machines(
         groups: Path, space: str, tmp_path: Path) -> None:
     sudo('ip', '-n', space, 'link', 'set', 'lo', 'up')
@@ -168,10 +140,16 @@ def test_launch_below_another_one_reaches_its_own_machines(
             assert group_of(own) == groups / each.name
             sudo('sh', '-c', 'echo $$ >"$1/cgroup.procs"; exec ip netns exec "$2" "$3" -c "$4"',
                  'sh', str(group_of(own)), space, sys.executable, SEND.format(each.address))
+        engine = group_of(pid) / 'engine'
+        sudo('mkdir', str(engine))
         for each in (outer, inner):
             for command in VPN.down(each):
                 do(space, command)
-        assert group_of(pid) == group_of(below) == groups
+        assert group_of(pid) == engine.parent and group_of(below) == groups
+        sudo('rmdir', str(engine))
+        for command in VPN.down(outer):
+            do(space, command)
+        assert group_of(pid) == groups
     assert not [path for path in groups.iterdir() if path.is_dir()]
     for each in (outer, inner):
         assert not list(Path('/run').glob(f'{each.name}*'))
