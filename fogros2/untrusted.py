@@ -14,6 +14,7 @@ import json
 import math
 import re
 from typing import Any, get_args, get_origin, get_type_hints, is_typeddict, Literal, Union
+import unicodedata
 
 #: Names of accounts, absolute paths, and public host keys (``ssh-ed25519 AAAA...``).
 NAME = re.compile('[a-z_][a-z0-9_-]{0,31}')
@@ -180,13 +181,21 @@ def _kind(value: Any) -> str:
 
 _REPLACEMENT = '\N{REPLACEMENT CHARACTER}'
 _NO_COLOUR = re.compile('\x1b(?!\\[[0-9;:]*m)')
+#: Unlike the other characters without a glyph, they reorder no text; many languages need them.
+_JOINERS = '\N{ZERO WIDTH NON-JOINER}\N{ZERO WIDTH JOINER}'
+
+
+def _harmless(character: str) -> bool:
+    """Return whether a terminal may get a character; str.isprintable refuses wide spaces."""
+    return character.isprintable() or character in _JOINERS \
+        or unicodedata.category(character) == 'Zs'
 
 
 class _Visible(dict[int, str]):
     """Characters as a terminal may get them; escape characters are those of colours."""
 
     def __missing__(self, code: int) -> str:
-        return chr(code) if chr(code).isprintable() else _REPLACEMENT
+        return chr(code) if _harmless(chr(code)) else _REPLACEMENT
 
 
 _VISIBLE = _Visible({0x1b: '\x1b', ord('\t'): '\t', ord('\n'): '\n', ord('\r'): '\n'})
@@ -206,5 +215,5 @@ def clean(text: str) -> str:
 
 def one_line(text: str) -> str:
     """Return a text in one line and without colours, as for a cell of a table."""
-    return ''.join(character if character.isprintable() else ' ' if character in '\t\n\r'
+    return ''.join(character if _harmless(character) else ' ' if character in '\t\n\r'
                    else _REPLACEMENT for character in text)

@@ -18,6 +18,7 @@ from fogros2.errors import MachineNotFound, ShellError, Unsupported
 from fogros2.model import Endpoint
 from fogros2.shell import ssh_config
 from fogros2.store import Store, write_private
+from fogros2.untrusted import one_line
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
 
@@ -87,7 +88,7 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
             _path(one, '%') for one in config.known_hosts)))
     pairs.append(('HostKeyAlias', config.label))
     for key, value in (*pairs, ('host key', to.host_key or '')):
-        if not value.isprintable() or key in ('HostName', 'User') and _MISREAD.search(value):
+        if one_line(value) != value or key in ('HostName', 'User') and _MISREAD.search(value):
             raise ShellError(f"'{name}' has a {key} that ssh would misread: {value!r}",
                              'its host or its provider may be hijacked')
     return f'Host {name}\n' + ''.join(f'    {key} {value}\n' for key, value in pairs if value)

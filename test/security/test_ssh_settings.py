@@ -22,7 +22,7 @@ from ros2fog_cli.api import ssh_settings
 pytestmark = pytest.mark.skipif(process.which('ssh') is None, reason='OpenSSH is not installed')
 
 ODD = ['198.51.100.7"', "'x", '#', '=', '=x', 'a b', 'a"b c"', '-oProxyCommand=id', '%h',
-       '${HOME}', '$(id)', '\\', 'a\tb', 'a\rb', '\u2028', 'é']
+       '${HOME}', '$(id)', '\\', 'a\tb', 'a\rb', '\u2028', 'é', '\u3000']
 
 
 def settings(file: Path, name: str) -> dict[str, str]:
@@ -50,7 +50,8 @@ def test_odd_name_is_refused_or_stays_one_word(tmp_path: Path, field: str, value
     assert found['stricthostkeychecking'] in ('yes', 'true')
 
 
-@pytest.mark.parametrize('name', ["it's", '#1', 'a=b', 'a b', 'a"b', '${HOME}', 'a\\b'])
+@pytest.mark.parametrize(
+    'name', ["it's", '#1', 'a=b', 'a b', 'a"b', '${HOME}', 'a\\b', 'a\u3000b'])
 def test_odd_path_of_a_key_is_refused_or_read(tmp_path: Path, name: str) -> None:
     file, key = tmp_path / 'config', f'/keys/{name}'
     endpoint = Endpoint('ssh', '198.51.100.7', 22, 'fog', 'ssh-ed25519 AAAA', key)

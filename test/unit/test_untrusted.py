@@ -92,3 +92,15 @@ def test_other_json_is_refused(text: str, why: str) -> None:
 def test_json_that_is_no_text_becomes_text(data: bytes) -> None:
     found: Any = untrusted.parsed(data, str)
     assert found.encode() and '\ufffd' in found
+
+
+@pytest.mark.parametrize('text', [
+    'Température\u202f: 25\xa0°C', '位置\u3000推定', 'می\u200cخواهم', '👩\u200d🔧 ready'])
+def test_text_of_any_language_stays(text: str) -> None:
+    assert untrusted.clean(text) == untrusted.one_line(text) == text
+
+
+@pytest.mark.parametrize('character', '\a\x7f\x85\u061c\u200e\u202e\u2028\u2029\u2066\U000e0041')
+def test_text_loses_characters_that_control_or_reorder(character: str) -> None:
+    text = f'位置\u3000{character}推定'
+    assert untrusted.clean(text) == untrusted.one_line(text) == '位置\u3000\ufffd推定'
