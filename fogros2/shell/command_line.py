@@ -92,19 +92,18 @@ def checked(command: Command, result: Result, where: str) -> Result:
     :raises CommandError: the exit status is not zero.
     """
     if result.returncode != 0:
-        raise CommandError(
-            command, result, where, hint_for(result.returncode, result.stderr, where))
+        raise CommandError(command, result, where, hint_for(command, result, where))
     return result
 
 
-def hint_for(returncode: int, stderr: str, where: str) -> str:
-    """Return the remedy for a common failure of commands, or ''."""
-    if 'No space left on device' in stderr or 'Disk quota exceeded' in stderr:
+def hint_for(command: Command, result: Result, where: str) -> str:
+    """Return the remedy for a common failure of commands, or ''; machines speak any language."""
+    if 'No space left on device' in result.stderr or 'Disk quota exceeded' in result.stderr:
         return f'the disk of {where} is full'
-    if 'password is required' in stderr or 'a terminal is required' in stderr:
-        return f'let the login user of {where} use sudo without a password'
-    if 'not in the sudoers file' in stderr or 'may not run sudo' in stderr:
-        return f'the login user of {where} needs the right to use sudo'
-    if returncode == 127 and 'not found' in stderr:
+    last = (result.stderr.splitlines() or [''])[-1]
+    program = words(command, root=True)[0]
+    if result.returncode == 127 or last.startswith(f'sudo: {program}: '):
         return f'install what is missing on {where}'
+    if last.startswith('sudo: ') and 'unable to resolve host' not in last:
+        return f'let the login user of {where} use sudo without a password'
     return ''

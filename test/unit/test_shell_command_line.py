@@ -12,7 +12,7 @@ import sys
 
 import pytest
 
-from fogros2.model import Command
+from fogros2.model import Command, Result
 from fogros2.shell import command_line
 
 
@@ -91,13 +91,21 @@ def test_a_file_that_can_t_be_written_leaves_nothing(tmp_path):
 
 @pytest.mark.parametrize('code, stderr, words', [
     (1, 'cat: write error: No space left on device', 'is full'),
-    (1, 'sudo: a password is required', 'without a password'),
-    (1, 'fog is not in the sudoers file.', 'right to use sudo'),
+    (1, 'sudo: a terminal is required to read the password\nsudo: a password is required\n',
+     'without a password'),
+    (1, 'sudo: Ein Passwort ist notwendig\n', 'without a password'),
+    (1, 'sudo: パスワードが必要です\n', 'without a password'),
+    (1, 'sudo: unable to resolve host gpu: Name or service not known\n', ''),
+    (1, 'sudo: colcon: command not found\n', 'install what is missing'),
+    (1, 'sudo: colcon: Befehl nicht gefunden\n', 'install what is missing'),
     (127, 'bash: line 1: colcon: command not found', 'install what is missing'),
+    (127, 'bash: Zeile 1: colcon: Kommando nicht gefunden.', 'install what is missing'),
     (1, 'something else', ''),
+    (1, '', ''),
 ])
 def test_common_failures_have_a_hint(code, stderr, words):
-    hint = command_line.hint_for(code, stderr, "'planner'")
+    hint = command_line.hint_for(
+        Command(('colcon',), sudo=True), Result(code, '', stderr), "'planner'")
     assert words in hint if words else not hint
 
 
