@@ -10,13 +10,15 @@ import pwd
 import re
 
 from fogros2 import process
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, ShellError
 from fogros2.model import Command, Endpoint
 
 _KEYS = ('~/.ssh/id_ed25519', '~/.ssh/id_ecdsa', '~/.ssh/id_rsa')
 _KNOWN_HOSTS = ('~/.ssh/known_hosts', '/etc/ssh/ssh_known_hosts')
 #: Seconds for the evaluation, which may run the commands of ``Match exec``.
 _TIMEOUT = 10.0
+#: Characters that end a value. An unpaired quote in a file ends ssh, for all hosts.
+MISREAD = re.compile('[ "\'#=]')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,3 +121,15 @@ def _proxy(
                 *(('-J', ','.join(before)) if before else ()),
                 '--', last if '://' in last else f'ssh://{last}')
     return ('sh', '-c', f'exec {command}') if command and command != 'none' else ()
+
+
+def quoted(path: str) -> str:
+    """
+    Quote a path for a file or an option of OpenSSH.
+
+    :raises ShellError: it cannot be quoted.
+    """
+    if '"' in path or '${' in path:
+        raise ShellError(f'ssh would misread the path {path!r}', 'rename the file or folder')
+    text = path.replace('%', '%%')
+    return f'"{text}"' if MISREAD.search(text) else text

@@ -33,7 +33,7 @@ from fogros2.errors import (
     WorkspaceError,
 )
 from fogros2.model import Command, Endpoint, Result, SyncReport
-from fogros2.shell import command_line, relay, Shell, ssh_connection
+from fogros2.shell import command_line, relay, Shell, ssh_config, ssh_connection
 from fogros2.shell.lines import KEPT
 from fogros2.store import entries
 
@@ -354,6 +354,7 @@ def open_ssh(endpoint: Endpoint) -> Iterator[relay.RemoteShell]:
 
     :raises HostKeyError: known_hosts cannot be read.
     :raises PrerequisiteError: the temporary file with the host key cannot be created.
+    :raises ShellError: OpenSSH would misread the path of a file.
     """
     words = [
         'ssh', '-F', 'none', '-T', '-p', str(endpoint.port),
@@ -366,7 +367,8 @@ def open_ssh(endpoint: Endpoint) -> Iterator[relay.RemoteShell]:
         '-c', ','.join(ssh_connection.CIPHERS),
     ]
     if endpoint.key_file is not None:
-        words += ['-o', 'IdentitiesOnly=yes', '-i', os.path.expanduser(endpoint.key_file)]
+        key = ssh_config.quoted(os.path.expanduser(endpoint.key_file))
+        words += ['-o', 'IdentitiesOnly=yes', '-o', f'IdentityFile={key}']
     # OpenSSH takes known_hosts from the account's home, Python from $HOME: use one file for both.
     try:
         known = tempfile.NamedTemporaryFile('w', prefix='fogros2-', suffix='.hosts')
@@ -377,8 +379,8 @@ def open_ssh(endpoint: Endpoint) -> Iterator[relay.RemoteShell]:
     with known:
         known.writelines(f'machine {key}\n' for key in ssh_connection.known_keys(endpoint).keys)
         known.flush()
-        words += ['-o', 'HostKeyAlias=machine', '-o', f'UserKnownHostsFile={known.name}',
-                  '-o', 'GlobalKnownHostsFile=/dev/null']
+        words += ['-o', 'HostKeyAlias=machine', '-o', 'GlobalKnownHostsFile=/dev/null',
+                  '-o', f'UserKnownHostsFile={ssh_config.quoted(known.name)}']
         children = []
 
         def run(line: str, stdin: int, stdout: int, stderr: int) -> int:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import glob
 from pathlib import Path
-import re
 import shlex
 
 from fogros2.errors import MachineNotFound, ShellError, Unsupported
@@ -24,8 +23,6 @@ from ros2fog_cli.api.machines import Entry
 
 #: Names of the files in a machine's folder.
 FILE, KNOWN_HOSTS = 'ssh_config', 'known_hosts'
-#: Characters that end a value. An unpaired quote in a file ends ssh, for all hosts.
-_MISREAD = re.compile('[ "\'#=]')
 
 
 def write(entry: Entry, store: Store) -> Path:
@@ -76,19 +73,20 @@ def settings(name: str, to: Endpoint, folder: Path) -> str:
              # not by the user's ProxyJump for all hosts, which the launch does not use either
              ('ProxyCommand', shlex.join(config.proxy).replace('%', '%%') or 'none')]
     if config.only_keys:
-        pairs += [('IdentityFile', _path(key, '%')) for key in config.keys]
+        pairs += [('IdentityFile', ssh_config.quoted(key)) for key in config.keys]
         pairs.append(('IdentitiesOnly', 'yes'))
     if to.host_key:
         config = dataclasses.replace(
             config, known_hosts=(str(folder / KNOWN_HOSTS),), label=label(name))
-        pairs += [('UserKnownHostsFile', _path(config.known_hosts[0], '%')),
+        pairs += [('UserKnownHostsFile', ssh_config.quoted(config.known_hosts[0])),
                   ('GlobalKnownHostsFile', '/dev/null'), ('StrictHostKeyChecking', 'yes')]
     elif to.alias:
         pairs.append(('UserKnownHostsFile', ' '.join(
-            _path(one, '%') for one in config.known_hosts)))
+            ssh_config.quoted(one) for one in config.known_hosts)))
     pairs.append(('HostKeyAlias', config.label))
     for key, value in (*pairs, ('host key', to.host_key or '')):
-        if one_line(value) != value or key in ('HostName', 'User') and _MISREAD.search(value):
+        if one_line(value) != value or \
+                key in ('HostName', 'User') and ssh_config.MISREAD.search(value):
             raise ShellError(f"'{name}' has a {key} that ssh would misread: {value!r}",
                              'its host or its provider may be hijacked')
     return f'Host {name}\n' + ''.join(f'    {key} {value}\n' for key, value in pairs if value)
@@ -99,7 +97,7 @@ def include(store: Store) -> str:
     root = glob.escape(str(store.root.absolute())).replace('\\', 4 * '\\')
     # OpenSSH 10 expands '%h', and 9 does not read '%%' as '%'; both match it by '?'
     root = root.replace('%', '?')
-    return f"Include {_path(f'{root}/machines/*/{FILE}')}"
+    return f"Include {ssh_config.quoted(f'{root}/machines/*/{FILE}')}"
 
 
 def included(line: str) -> bool:
@@ -109,16 +107,3 @@ def included(line: str) -> bool:
         return line in map(str.strip, config.read_text().splitlines())
     except (OSError, ValueError):
         return False
-
-
-def _path(path: str, doubled: str = '') -> str:
-    """
-    Quote a path.
-
-    :param doubled: a character that has to be written twice.
-    :raises ShellError: it cannot be quoted.
-    """
-    text = path.replace(doubled, 2 * doubled) if doubled else path
-    if '"' in text or '${' in text:
-        raise ShellError(f'ssh would misread the path {text!r}', 'rename the file or folder')
-    return f'"{text}"' if _MISREAD.search(text) else text

@@ -9,10 +9,12 @@ import dataclasses
 import grp
 import os
 from pathlib import Path
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import termios
 import threading
 import time
@@ -466,6 +468,19 @@ def test_large_folder_goes_by_openssh_and_a_change_does_not(
     assert report.files == 1
     assert report.bytes < 20_000
     assert not compare(source, target)
+
+
+def test_openssh_finds_its_files_in_odd_folders(server, source, tmp_path, monkeypatch):
+    odd = tmp_path / "Max' 100%zz #1"
+    odd.mkdir()
+    key = shutil.copy2(server.folder / 'id', odd)
+    monkeypatch.setattr(sync, 'BULK', 1000)
+    monkeypatch.delattr(relay, 'relay')
+    monkeypatch.setattr(tempfile, 'tempdir', str(odd))
+    endpoint = dataclasses.replace(server.endpoint, key_file=str(key))
+    with contextlib.closing(SSHShell(endpoint, name='planner', timeout=60.0)) as shell:
+        report = shell.sync(source, str(tmp_path / 'sync-target'), excludes=[], timeout=60.0)
+    assert report.files == 200
 
 
 def test_file_written_twice_in_a_second_is_sent_twice(shell, source, tmp_path):

@@ -42,7 +42,8 @@ def openssh(endpoint, folder, monkeypatch):
             stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=10,
             env={**os.environ, **variables})
         words = said.stdout.splitlines()
-        known, = (Path(w.partition('=')[2]) for w in words if w.startswith('UserKnownHostsFile='))
+        known, = (Path(w.partition('=')[2].strip('"').replace('%%', '%'))
+                  for w in words if w.startswith('UserKnownHostsFile='))
         assert (said.returncode, failures) == (0, [])
         yield words, known
     assert not known.exists()
@@ -53,7 +54,8 @@ def test_openssh_is_pinned_as_we_are(tmp_path, monkeypatch):
         for option in ('StrictHostKeyChecking=yes', 'BatchMode=yes', 'IdentitiesOnly=yes',
                        'GlobalKnownHostsFile=/dev/null', 'HostKeyAlias=machine'):
             assert option in words
-        assert '/keys/my key' in words and words[-3:] == ['--', '198.51.100.7', 'rsync --server']
+        assert 'IdentityFile="/keys/my key"' in words
+        assert words[-3:] == ['--', '198.51.100.7', 'rsync --server']
         assert known.read_text() == 'machine ssh-ed25519 AAAA\n'
         assert known.stat().st_mode & 0o077 == 0
 
