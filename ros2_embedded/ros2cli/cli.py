@@ -47,7 +47,10 @@ def main(*, script_name: str = 'ros2', argv: list[str] | None = None) -> Any:
             autocomplete(parser, exclude=['-h', '--help'])
         args = parser.parse_args(args=argv)
         if hasattr(sys.stdout, 'reconfigure'):
-            sys.stdout.reconfigure(line_buffering=True)
+            strict = sys.stdout.errors == 'strict'
+            # the user's terminal may lack a character of a topic or of a tree
+            sys.stdout.reconfigure(
+                line_buffering=True, errors='backslashreplace' if strict else None)
         if not hasattr(args, '_command'):
             parser.print_help()
             return 0

@@ -176,6 +176,13 @@ def test_launch_description_is_printed(package, ros2):
     assert "ExecuteProcess(cmd=[ExecInPkg(pkg='pkg', exec='sleeper'), '--ros-args', '-r', " in out
 
 
+@embedded_alone
+def test_terminal_that_lacks_a_character_gets_its_number(package):
+    done = subprocess.run([ROS2, 'launch', '-p', 'pkg', 'a.launch.py'], capture_output=True,
+                          env={**os.environ, 'PYTHONIOENCODING': 'latin-1'}, timeout=60)
+    assert (done.returncode, done.stderr) == (0, b'') and rb'\u2500\u2500 LogInfo' in done.stdout
+
+
 def test_launch_file_runs_with_arguments(package, ros2):
     status, out, err = ros2('launch', 'pkg', 'say.launch.xml', 'word:=one', 'word:=two')
     assert (status, err) == (0, '') and '[INFO] [launch.user]: says two' in out.splitlines()

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import errno
+import io
 import json
 import os
 import sys
@@ -68,10 +69,16 @@ class _Output:
 
 @contextlib.contextmanager
 def cleaned() -> Iterator[None]:
-    """Clean what is printed in this block; a closed stream is /dev/null."""
+    """
+    Clean what is printed in this block; a closed stream is /dev/null.
+
+    A character that the encoding of standard output lacks becomes an escape sequence of Python.
+    """
     for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == 'strict':
+        sys.stdout.reconfigure(errors='backslashreplace')
     with contextlib.redirect_stdout(cast(TextIO, _Output(sys.stdout, True))), \
             contextlib.redirect_stderr(cast(TextIO, _Output(sys.stderr, False))):
         yield

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 from pathlib import Path
@@ -22,7 +23,7 @@ from fogros2.provider import Capabilities, TAG_NAME, TAG_ROBOT
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2_testing.fakes import FakeProvider
 from fogros2_testing.plugins import instead
-from ros2fog_cli.api import awaiting, bugreport, ssh_settings
+from ros2fog_cli.api import awaiting, bugreport, output, ssh_settings
 from ros2fog_cli.api.doctor import Check
 
 ROOT = Path(__file__).parents[2]
@@ -312,3 +313,11 @@ def test_output_that_is_lost_is_one_line(tmp_path: Path) -> None:
     done = subprocess.run(['sh', '-c', 'exec ros2 fog --version <&- >&- 2>&-'], env=env,
                           timeout=60)
     assert done.returncode == 0
+
+
+def test_character_that_the_terminal_lacks_ends_no_verb(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = io.BytesIO()
+    monkeypatch.setattr('sys.stdout', io.TextIOWrapper(shown, 'latin-1'))
+    with output.cleaned():
+        print('[planner] ✓ fähig', flush=True)
+    assert shown.getvalue() == b'[planner] \\u2713 f\xe4hig\n'
