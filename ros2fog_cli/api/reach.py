@@ -241,7 +241,8 @@ def ping(address: str, count: int = 5) -> Optional[float]:
     """Return the median round trip of pings in milliseconds, None if no ping was answered."""
     try:
         result = process.run(
-            Command(('ping', '-n', '-c', str(count), '-i', '0.2', '-W', '1', address)),
+            Command(('ping', '-n', '-c', str(count), '-i', '0.2', '-W', '1', address),
+                    environment={'LC_ALL': 'C'}),
             timeout=count + 5.0, check=False)
     except FogError:
         return None

@@ -23,7 +23,7 @@ from fogros2.provider import Capabilities, TAG_NAME, TAG_ROBOT
 from fogros2.store import process_start, Record, robot_name, Store
 from fogros2_testing.fakes import FakeProvider
 from fogros2_testing.plugins import instead
-from ros2fog_cli.api import awaiting, bugreport, output, ssh_settings
+from ros2fog_cli.api import awaiting, bugreport, output, reach, ssh_settings
 from ros2fog_cli.api.doctor import Check
 
 ROOT = Path(__file__).parents[2]
@@ -321,3 +321,15 @@ def test_character_that_the_terminal_lacks_ends_no_verb(monkeypatch: pytest.Monk
     with output.cleaned():
         print('[planner] ✓ fähig', flush=True)
     assert shown.getvalue() == b'[planner] \\u2713 f\xe4hig\n'
+
+
+def test_round_trip_is_read_from_a_translated_ping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / 'ping').write_text(
+        '#!/bin/sh\n[ "$LC_ALL" = C ] && word=time || word=Zeit\n'
+        'for each in 0.9 0.412 0.3; do echo "64 bytes from $8: icmp_seq=1 $word=$each ms"; done\n')
+    (tmp_path / 'ping').chmod(0o755)
+    monkeypatch.setitem(process._ENVIRONMENT, 'PATH', f'{tmp_path}:/usr/bin:/bin')
+    monkeypatch.setitem(process._ENVIRONMENT, 'LC_ALL', 'de_DE.UTF-8')
+    assert reach.ping('198.51.100.7') == 0.412
