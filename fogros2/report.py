@@ -6,8 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
+import os
 import time
-from typing import Union
+from typing import TextIO, Union
 
 from fogros2.clock import ClockOffset
 
@@ -93,6 +94,11 @@ def size(number: float) -> str:
             return f'{number:.0f} {unit}' if unit == 'B' else f'{number:.1f} {unit}'
         number /= 1000
     return f'{number:.1f} TB'
+
+
+def redraws(stream: TextIO) -> bool:
+    """Return whether a stream is a terminal that replaces a line and shows colours."""
+    return stream.isatty() and os.environ.get('TERM') != 'dumb'
 
 
 def silent(event: Event) -> None:

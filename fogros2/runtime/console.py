@@ -25,6 +25,7 @@ from fogros2.report import (
     ClockMeasured,
     Event,
     Progress,
+    redraws,
     Silence,
     size,
     StepDone,
@@ -120,7 +121,7 @@ class Console:
         self._lock = threading.RLock()
         self._running: dict[tuple[str, str], _Running] = {}
         self._drawn = False
-        self._live = self._stream.isatty()
+        self._live = redraws(self._stream.stream)
         self._ticks = Periodic('fog-progress', TICK, self._tick)
         if self._live:
             # a log line overwrites the progress line instead of following it

@@ -12,7 +12,7 @@ import time
 from typing import Optional
 
 from fogros2 import waiting
-from fogros2.report import Event, StepFailed
+from fogros2.report import Event, redraws, StepFailed
 from fogros2.untrusted import one_line
 from ros2fog_cli.api.output import uncleaned
 
@@ -47,7 +47,7 @@ class _Working:
     def __init__(self, what: str) -> None:
         self._what = what
         self._begin = self._told = time.monotonic()
-        self._live = sys.stderr.isatty()
+        self._live = redraws(sys.stderr)
         self._drawn = False
 
     def tick(self) -> None:

@@ -10,7 +10,7 @@ import os
 from typing import Any, TextIO
 
 from fogros2 import feature
-from fogros2.report import size
+from fogros2.report import redraws, size
 from fogros2.untrusted import one_line
 from ros2fog_cli.api.output import uncleaned
 from ros2fog_cli.api.table import (
@@ -42,7 +42,7 @@ Paint = Callable[[str, str], str]
 
 def painter(stream: TextIO) -> Paint:
     """Return a function that adds a style to a text, if the stream and the user allow colours."""
-    if not stream.isatty() or os.environ.get('NO_COLOR') or os.environ.get('TERM') == 'dumb':
+    if not redraws(stream) or os.environ.get('NO_COLOR'):
         return plain
 
     def paint(text: str, style: str) -> str:

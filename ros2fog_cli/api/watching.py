@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import select
 import shutil
 import sys
@@ -12,6 +11,7 @@ import time
 from typing import Any, Optional
 
 from fogros2.errors import DeadlineExceeded
+from fogros2.report import redraws
 from fogros2.store import check_name
 from fogros2.waiting import wait_until
 from ros2fog_cli.api import output, screen
@@ -36,7 +36,7 @@ def watch(
     live = Live(name=name, regions=regions, topics=topics)
     live.start()
     try:
-        if as_json or not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':
+        if as_json or not redraws(sys.stdout):
             _lines(live, name, as_json)
         else:
             _screen(live, name)

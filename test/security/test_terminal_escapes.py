@@ -171,6 +171,7 @@ def test_a_name_makes_no_row_of_its_own() -> None:
 def test_progress_line_still_moves_the_cursor(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setenv('TERM', 'xterm')
     monkeypatch.setattr('sys.stderr.isatty', lambda: True)
     monkeypatch.setattr(progress, 'TICK', 0.01)
     drawn: list[str] = []

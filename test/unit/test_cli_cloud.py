@@ -796,11 +796,13 @@ def slow_cloud(monkeypatch: pytest.MonkeyPatch, over: Callable[[], bool]) -> Non
 
 @pytest.mark.parametrize(('verb', 'still'), [
     (('delete', 'slam', '--yes'), 'still deleting after'), (('gc',), 'still clearing after')])
+@pytest.mark.parametrize('stream', [io.StringIO, Terminal])
 def test_slow_deletion_is_told_without_a_terminal(
-    monkeypatch: pytest.MonkeyPatch, verb: Sequence[str], still: str,
+    monkeypatch: pytest.MonkeyPatch, verb: Sequence[str], still: str, stream: type[io.StringIO],
 ) -> None:
+    monkeypatch.setenv('TERM', 'dumb')
     machine('slam', expires=time.time() - 3600)
-    said = io.StringIO()
+    said = stream()
     slow_cloud(monkeypatch, lambda: said.getvalue().count('still') >= 3)
     monkeypatch.setattr(progress, 'STILL', 0.05)
     monkeypatch.setattr(sys, 'stderr', said)
@@ -813,6 +815,7 @@ def test_running_time_of_a_deletion_makes_room_for_lines(monkeypatch: pytest.Mon
     for name in ('one', 'two'):
         machine(name)
     shown = Terminal()
+    monkeypatch.setenv('TERM', 'xterm')
     slow_cloud(monkeypatch, lambda: 'waiting for' in shown.getvalue())
     monkeypatch.setattr(sys, 'stderr', shown)
     monkeypatch.setattr(sys, 'stdout', shown)

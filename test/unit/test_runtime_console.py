@@ -83,9 +83,12 @@ def test_lines(lines):
         ('WARNING', "it may lack x\nadd pip=['x']")]
 
 
-def test_progress_on_a_terminal_only():
+def test_progress_on_a_terminal_only(monkeypatch):
     launch.logging.launch_config.level = logging.INFO
-    for stream, drawn in ((io.StringIO(), False), (Terminal(), True)):
+    for stream, kind, drawn in (
+            (io.StringIO(), 'xterm', False), (Terminal(), 'dumb', False),
+            (Terminal(), 'xterm', True)):
+        monkeypatch.setenv('TERM', kind)
         console = Console(stream)
         console(StepStarted('planner', 'sync'))
         console(Progress('planner', 'sync', 250_000_000, 1_000_000_000))
@@ -138,7 +141,8 @@ def test_launch_that_was_stopped_says_once_what_it_does(lines):
     assert [text for _, text in lines][1:-1] == ['planner: machine: still working after 480 s']
 
 
-def test_running_time_is_on_a_terminal(lines):
+def test_running_time_is_on_a_terminal(lines, monkeypatch):
+    monkeypatch.setenv('TERM', 'xterm')
     terminal = Terminal()
     console = Console(terminal)
     with step(console, 'planner', 'machine'):
