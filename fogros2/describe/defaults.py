@@ -112,7 +112,7 @@ def _parsed(path: Path) -> dict[str, Any]:
         except ModuleNotFoundError:
             continue
         try:
-            parsed: dict[str, Any] = toml.loads(path.read_text())
+            parsed: dict[str, Any] = toml.loads(path.read_text('utf-8'))
         except (OSError, ValueError, RecursionError) as error:
             raise ConfigurationError(f"{path} can't be read: {error}",
                                      'it is TOML, such as: lifetime = "4h"') from error

@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.util
 import os
 from pathlib import Path
+import subprocess
 import sys
 
 from launch import LaunchContext
@@ -133,6 +134,16 @@ def test_option_that_a_provider_refuses_names_the_file(own, provider, text, name
     with pytest.raises(ConfigurationError) as wrong, defaults.named(os.environ):
         provider().check(machine)
     assert wrong.value.hint.endswith(f'; {own} sets {name}')
+
+
+def test_file_is_utf_8_in_any_locale(own):
+    own.write_text("container_image = 'lab/Größe'", 'utf-8')
+    code = ('import pathlib, sys\nfrom fogros2.describe import defaults\n'
+            'print(ascii(defaults._parsed(pathlib.Path(sys.argv[1]))))')
+    done = subprocess.run(
+        [sys.executable, '-X', 'utf8=0', '-c', code, own], capture_output=True, text=True,
+        env={**os.environ, 'LC_ALL': 'C', 'PYTHONCOERCECLOCALE': '0'})
+    assert done.stdout == r"{'container_image': 'lab/Gr\xf6\xdfe'}" + '\n', done.stderr
 
 
 def test_python_without_toml_names_the_remedy(own, monkeypatch):
