@@ -72,17 +72,18 @@ def test_change_makes_the_last_search_invalid(tmp_path: Path, change: str) -> No
 
 def test_machine_gets_a_search_of_its_own_folders(tmp_path: Path) -> None:
     top, cache, shown = tmp_path / 'top', tmp_path / 'cache/hidden', tmp_path / 'shown'
-    for folder in (top, shown, shown / 'a', shown / 'b'):
+    other = os.fsdecode(b'J\xfcrgen')  # no UTF-8
+    for folder in (top, shown, shown / 'a', shown / other):
         folder.mkdir(0o755)
-    for name in 'ab':
+    for name in ('a', other):
         (shown / name / 'secret').write_text('x')
         (shown / name / 'secret').chmod(0o600)
     end_of_tick()
-    for names in ('a', 'ab', 'b', 'b'):
-        (top / 'shown').write_text(''.join(f'{shown / name}\n' for name in names))
+    for names in (['a'], ['a', other], [other], [other]):
+        (top / 'shown').write_bytes(b''.join(bytes(shown / name) + b'\n' for name in names))
         hidden_files.main(str(top), str(cache))
         assert (top / 'hidden').read_bytes() == b''.join(
-            f'{shown / name}/secret\0'.encode() for name in names)
+            bytes(shown / name / 'secret') + b'\0' for name in names)
         assert set(hidden_files.read(str(cache))) == {str(shown / name) for name in names}
-        if names != 'a':
+        if names != ['a']:
             cache.write_bytes(cache.read_bytes()[:-9])

@@ -226,7 +226,7 @@ def test_shared_folder_of_another_machine_gives_no_rights(attacked: Attacked) ->
 def test_login_id_is_in_no_subordinate_range(tmp_path: Path) -> None:
     path = tmp_path / 'subuid'
     first = login_ids.login_id('token', [])
-    path.write_text(f'# a line\nalice:{first - 5}:10\n')
+    path.write_bytes(f'# a line\nJürgen:{first - 5}:10\n'.encode('latin-1'))
     second = login_ids.login_id('token', [path, tmp_path / 'missing'])
     another = login_ids.login_id('another token', [])
     assert len({first, second, another}) == 3 and all(

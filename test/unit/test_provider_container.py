@@ -130,6 +130,15 @@ def test_accounts_are_the_system_s_and_the_login_user_s(etc):
     assert found['home/fog/.bashrc'].uid == 2013265999
 
 
+def test_account_of_another_encoding_keeps_its_bytes(etc):
+    line = 'audio:x:29:29:Jürgen:/:/bin/false\n'.encode('latin-1')
+    with open(etc / 'passwd', 'ab') as file:
+        file.write(line)
+    archive = container_root.Archive()
+    container_root.accounts(archive, 'fog', 2013265999, etc)
+    assert b'\n' + line in archive.data()
+
+
 def test_the_skeleton_of_this_computer_holds_no_home_and_no_key():
     data = container_root.skeleton() + container_root.Archive().data()
     found = content(data)
@@ -169,11 +178,14 @@ def test_mounts_cover_prefix_underlays_and_editable_packages(tmp_path, monkeypat
 
 def test_the_file_system_of_a_path_is_the_innermost_mount(tmp_path):
     table = tmp_path / 'mountinfo'
-    table.write_text(
-        '1 0 8:1 / / rw - ext4 /dev/a rw\n'
-        '2 1 0:5 / /var/lib/cont\\040ainers rw,relatime shared:3 - overlay none rw\n'
-        '3 1 0:6 / /var rw - xfs /dev/b rw\n')
+    table.write_bytes(
+        b'4 1 8:2 / /media/M\xfcller rw - vfat /dev/c rw\n'
+        b'5 1 8:3 / /media/a\xe3\x80\x80b rw - xfs /dev/d rw\n'
+        b'1 0 8:1 / / rw - ext4 /dev/a rw\n'
+        b'2 1 0:5 / /var/lib/cont\\040ainers rw,relatime shared:3 - overlay none rw\n'
+        b'3 1 0:6 / /var rw - xfs /dev/b rw\n')
     assert container_root.file_system(Path('/etc'), table) == 'ext4'
+    assert container_root.file_system(Path('/media/a\u3000b/c'), table) == 'xfs'
     assert container_root.file_system(Path('/var/log'), table) == 'xfs'
     assert container_root.file_system(Path('/var/lib/cont ainers/x'), table) == 'overlay'
 

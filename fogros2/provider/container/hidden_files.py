@@ -122,8 +122,8 @@ def write(path: str, data: bytes) -> None:
 def main(top: str, cache: str = CACHE) -> None:
     """Write a machine's hidden files, by the last results for its folders where they are valid."""
     begin = time.time_ns()
-    with open(f'{top}/shown') as file:
-        folders = file.read().splitlines()
+    with open(f'{top}/shown', 'rb') as file:
+        folders = os.fsdecode(file.read()).split('\n')[:-1]
     results = read(cache)
     fresh = {folder: search(folder) for folder in folders
              if folder not in results or not unchanged(results[folder][1])}

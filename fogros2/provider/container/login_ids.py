@@ -30,8 +30,9 @@ def login_id(token: str, subordinate: Sequence[Path] = SUBORDINATE) -> int:
     :param token: of the machine; another machine has another token, and so another id.
     :raises PrerequisiteError: subordinate ranges or accounts have all ids.
     """
-    ranges = [(int(words[1]), int(words[1]) + int(words[2]))
-              for path in subordinate if path.exists() for line in path.read_text().splitlines()
+    lines = [line for path in subordinate if path.exists()
+             for line in path.read_text(errors='replace').splitlines()]
+    ranges = [(int(words[1]), int(words[1]) + int(words[2])) for line in lines
               if len(words := line.split(':')) == 3 and words[1].isdigit() and words[2].isdigit()]
     mapped = [[int(word) for word in line.split()]
               for line in Path('/proc/self/uid_map').read_text().splitlines()]

@@ -186,8 +186,8 @@ def file_system(path: Path, table: Path = Path('/proc/self/mountinfo')) -> str:
 
 
 def _mounts(table: Path) -> Iterator[tuple[str, str]]:
-    for line in table.read_text().splitlines():
-        words = line.split()
+    for line in table.read_text(errors='surrogateescape').splitlines():
+        words = line.split(' ')
         yield re.sub(r'\\([0-7]{3})', lambda m: chr(int(m[1], 8)), words[4]), \
             words[words.index('-') + 1]
 
@@ -231,7 +231,8 @@ def accounts(archive: Archive, user: str, number: int, etc: Path = Path('/etc'))
     home, own = ('/root', '0') if user == 'root' else (f'/home/{user}', str(number))
 
     def system(name: str, columns: int) -> list[list[str]]:
-        rows = (line.split(':') for line in (etc / name).read_text().splitlines())
+        lines = (etc / name).read_text(errors='surrogateescape').splitlines()
+        rows = (line.split(':') for line in lines)
         return [row for row in rows
                 if len(row) == columns and _system(row[2]) and row[0] != user]
 
@@ -239,7 +240,7 @@ def accounts(archive: Archive, user: str, number: int, etc: Path = Path('/etc'))
     groups = [*([*row[:3], ''] for row in system('group', 4)), [user, 'x', own, '']]
 
     def text(rows: Iterable[Sequence[str]]) -> bytes:
-        return ''.join(':'.join(row) + '\n' for row in rows).encode()
+        return os.fsencode(''.join(':'.join(row) + '\n' for row in rows))
 
     archive.file('etc/passwd', text(people))
     archive.file('etc/group', text(groups))
