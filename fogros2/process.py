@@ -200,11 +200,11 @@ def run(
                     on_output(line.decode(errors='replace').rstrip('\n'))
 
     threads = [threading.Thread(target=read, args=(name,), daemon=True) for name in output]
-    for thread in threads:
-        thread.start()
     deadline = time.monotonic() + timeout
     what = command.what or words[0]
     try:
+        for thread in threads:
+            thread.start()
         with noted(what):
             while True:
                 remaining = deadline - time.monotonic()

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 import signal
 import subprocess
+from typing import Any
 import uuid
 
 import pytest
@@ -204,6 +205,7 @@ def test_an_interrupt_ends_the_command(tmp_path: Path) -> None:
 
     def interrupt(*_: object) -> None:
         if written.read_text():
+            signal.setitimer(signal.ITIMER_REAL, 0.0)  # a second one would end the ending
             raise KeyboardInterrupt
 
     written.write_text('')
@@ -216,3 +218,27 @@ def test_an_interrupt_ends_the_command(tmp_path: Path) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
     assert not Path('/proc', written.read_text().strip()).exists()
+
+
+def test_an_interrupt_before_the_output_is_read_ends_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    children: list[subprocess.Popen[bytes]] = []
+
+    def interrupt(thread: object) -> None:
+        raise KeyboardInterrupt
+
+    def start(*words: Any, **options: Any) -> subprocess.Popen[bytes]:
+        children.append(original(*words, **options))
+        return children[0]
+
+    original = process.start
+    monkeypatch.setattr(process, 'start', start)
+    monkeypatch.setattr(process.threading.Thread, 'start', interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        process.run(Command.script('exec sleep 60'), timeout=60.0)
+    with children[0] as child:
+        try:
+            assert child.returncode == -signal.SIGTERM
+        finally:
+            child.kill()
