@@ -8,7 +8,6 @@ from concurrent.futures import as_completed, ThreadPoolExecutor
 import contextlib
 import dataclasses
 import functools
-import math
 from pathlib import Path
 import re
 import time
@@ -34,7 +33,7 @@ from fogros2.report import Reporter, step
 from fogros2.shell import Shell
 from fogros2.store import is_another_robot, launch_process, Record, Store
 from fogros2.vpn import owner
-from fogros2.waiting import Timeouts, wait_until
+from fogros2.waiting import Timeouts
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
 
@@ -42,24 +41,26 @@ from ros2fog_cli.api.machines import Entry
 KEEP_STOPPED = 7 * 86400.0
 #: Seconds after the end of its lifetime in which a machine may still be deleting itself.
 GRACE = 60.0
-#: Time-out in seconds of a machine's answer about its launch.
-ANSWER = 5.0
-#: Age in seconds of the last heartbeat at which a launch counts as gone: three are missing.
-GONE = 7.0
 #: Age in seconds after which gc deletes a launch's folder that has no process file.
 FOLDER_AGE = 86400.0
 
 
 def check_free(entry: Entry, *, force: bool) -> None:
     """
-    Refuse to delete a machine that a running launch uses.
+    Refuse to delete a machine that a running launch uses, or may use on another computer.
 
-    :raises NameTaken: the launch is alive, and ``force`` is False.
+    :raises NameTaken: the launch is alive, or the record is in a state folder that was copied from
+        another computer; and ``force`` is False.
     """
-    if entry.record is not None and entry.record.launch_alive and not force:
-        raise NameTaken(
-            f"the launch with process {entry.record.pid} has the machine '{entry.name}'",
-            'end that launch, or delete with --force')
+    record = entry.record
+    if record is None or force:
+        return
+    if record.launch_alive:
+        raise NameTaken(f"the launch with process {record.pid} has the machine '{entry.name}'",
+                        'end that launch, or delete with --force')
+    if entry.machine is not None and is_another_robot(record.robot):
+        raise NameTaken(f"the machine '{entry.name}' belongs to the robot {record.robot}",
+                        'delete it there, or with --force')
 
 
 def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False) -> None:
@@ -82,11 +83,8 @@ def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False)
                 f"the provider '{entry.provider}' of '{entry.name}' can't be asked",
                 '--force forgets the machine here; it may go on by itself')
         if entry.machine is not None:
-            if entry.record is not None:
-                if not entry.machine.owned:
-                    _leave(entry, entry.record, entry.machine, force=force)
-                elif not force:
-                    _check_unused(entry, entry.record)
+            if entry.record is not None and not entry.machine.owned:
+                _leave(entry, entry.record, entry.machine, force=force)
             _destroy(entry.machine)
         record = entry.record
         if record is None:
@@ -165,50 +163,6 @@ def _destroy(machine: Machine) -> None:
                             f'ros2 fog delete {machine.name} tries again')
 
 
-def _check_unused(entry: Entry, record: Record) -> None:
-    """
-    Check that no launch on another computer uses a machine of which this robot has a record.
-
-    :raises NameTaken: the agent gets heartbeats of a launch.
-    """
-    if _sure(record) or entry.machine is None or entry.machine.state is not MachineState.RUNNING:
-        return
-    used = False
-    with contextlib.suppress(FogError), reach.session(entry, timeout=ANSWER) as shell, \
-            _agent(record, shell) as client:
-        used = client is not None and _hears_launch(client)
-    if used:
-        raise _used(record)
-
-
-def _sure(record: Record) -> bool:
-    """
-    Return whether a record tells if the machine's launch lives.
-
-    A record in a copied state folder may be another computer's: then the machine's agent has to
-    be asked.
-    """
-    return record.robot != '' and not is_another_robot(record.robot)
-
-
-def _hears_launch(client: AgentClient) -> bool:
-    """Return whether an agent gets heartbeats."""
-    ages: list[float] = []
-
-    def decided() -> bool:
-        age = client.status(timeout=ANSWER)['heartbeat_age']
-        ages.append(math.inf if age is None else age)
-        return ages[-1] > GONE or ages[-1] < ages[0]
-
-    wait_until(decided, timeout=2 * GONE, interval=1.0, what='a heartbeat')
-    return ages[-1] <= GONE
-
-
-def _used(record: Record) -> NameTaken:
-    return NameTaken(f"a launch on another computer uses the machine '{record.name}'",
-                     'end that launch, or delete with --force')
-
-
 @contextlib.contextmanager
 def _agent(record: Record, shell: Shell) -> Iterator[Optional[AgentClient]]:
     """Yield a client of the agent that a record names, None if the agent has ended."""
@@ -268,8 +222,6 @@ def _leave(entry: Entry, record: Record, machine: Machine, *, force: bool) -> No
                     launch = client.status()['launch']
                     if launch not in ('', record.launch, record.last):
                         return  # our agent is gone, and another robot uses the computer now
-                    if not force and not _sure(record) and _hears_launch(client):
-                        raise _used(record)
             undo.unmake_all(_Left(record, machine, shell), record.made)
     except FogError as error:
         # another robot may have taken the account away

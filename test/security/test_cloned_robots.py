@@ -8,7 +8,6 @@ Both have the same host name, user id and state folder, here also the same machi
 from __future__ import annotations
 
 from collections.abc import Callable
-import contextlib
 import dataclasses
 from pathlib import Path
 import shutil
@@ -18,15 +17,14 @@ import pytest
 from ros2cli.cli import main
 
 from fogros2 import store
-from fogros2.agent_client import AgentClient
 from fogros2.deploy.steps.creating import Creation
 from fogros2.errors import NameTaken
-from fogros2.model import MachineSpec, Result
+from fogros2.model import MachineSpec
 from fogros2.store import robot_name, Store
-from fogros2_testing.fakes import FakeProvider, FakeShell, FakeVpn
+from fogros2_testing.fakes import FakeProvider, FakeVpn
 from fogros2_testing.plugins import instead
 from rigs.deploying import job
-from ros2fog_cli.api import machines, reach
+from ros2fog_cli.api import machines
 
 SPEC = MachineSpec('slam', 'fake')
 #: The launch's process, seen from another computer: none.
@@ -111,25 +109,16 @@ def test_renamed_robot_keeps_its_machines(
     assert list(provider.find({})) == []
 
 
-@pytest.mark.parametrize(('ages', 'left'), [
-    ([0.5, 1.5, 0.4], 1), ([0.0, 3.0, 7.1], 0), ([None], 0)])
-def test_machine_in_use_elsewhere_needs_force(
-    provider: FakeProvider, boot: Callable[[str], None], monkeypatch: pytest.MonkeyPatch,
-    ages: list[Any], left: int, capsys: pytest.CaptureFixture[str],
+def test_delete_with_a_copied_record_needs_force(
+    provider: FakeProvider, boot: Callable[[str], None],
 ) -> None:
-    """Its record is in a copied state folder, so only its agent knows whether a launch lives."""
-    launched(agent='/run/fogros2/slam', agent_program='/run/fogros2/slam/agent.py')
-    monkeypatch.setattr(reach, 'session', lambda *_, **__: contextlib.nullcontext(
-        FakeShell(handlers={'test': lambda command: Result(0, '', '')})))
-    monkeypatch.setattr(AgentClient, 'status',
-                        lambda *_, **__: {'heartbeat_age': ages.pop(0)})
+    """Only the other computer knows whether a launch uses the machine."""
+    launched()
     boot('02:00:00:00:00:02')
-    assert main(argv=['fog', 'delete', 'slam', '--yes']) == left
-    assert len(list(provider.find({}))) == left
-    if left:
-        assert 'a launch on another computer uses the machine' in capsys.readouterr().err
-        assert main(argv=['fog', 'delete', 'slam', '--yes', '--force']) == 0
-        assert list(provider.find({})) == []
+    assert 'belongs to the robot' in str(main(argv=['fog', 'delete', 'slam', '--yes']))
+    assert len(list(provider.find({}))) == 1
+    assert main(argv=['fog', 'delete', 'slam', '--yes', '--force']) == 0
+    assert list(provider.find({})) == []
 
 
 def test_id_stays_without_a_state_folder(
