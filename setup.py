@@ -177,9 +177,6 @@ setup(
         'fogros2.monitor': [
             'graph = fogros2_monitor:GRAPH',
         ],
-        'fogros2.price': [
-            'replicas = fogros2_features.replicas.price',
-        ],
         'fogros2.shell': [
             'guest = fogros2_features.guests.shell:GuestShell',
             'kubernetes = fogros2.shell.kubernetes:KubernetesShell',

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from fogros2_features.prices.offers import Offer
 
 
-
 class PriceVerb(VerbExtension):
     """List the machine types of all clouds that match, cheapest first."""
 
@@ -45,8 +44,6 @@ class PriceVerb(VerbExtension):
         complete(region, region_names)
         parser.add_argument('--limit', type=number, default=10, metavar='N',
                             help='rows to show, 0 for all (default: 10)')
-        for option in options():
-            option.add_arguments(parser)
         parser.add_argument('--refresh', action='store_true',
                             help='do not use prices of the last 24 hours')
         provider = parser.add_argument(
@@ -91,10 +88,6 @@ class PriceVerb(VerbExtension):
             rest = len(choice.offers) - len(shown)
             if rest:
                 print(f"{rest} more {'cost' if rest > 1 else 'costs'} as much or more (--limit 0)")
-            for option in options():
-                line = option.line(choice.offers, args)
-                if line:
-                    print(line)
         for who, reason in choice.left_out:
             warn(f'{who}: {reason}')
         others = clouds.clouds()[1]
@@ -115,17 +108,6 @@ def to_json(offer: Offer) -> dict[str, Any]:
         'spot_price': None if offer.spot_price is None else float(offer.spot_price),
         'round_trip_ms': offer.round_trip_ms,
     }
-
-
-def options() -> list[Any]:
-    """
-    Return the options that other features add: entry points of the group ``fogros2.price``.
-
-    Each has ``add_arguments(parser)`` and ``line(offers, args)``, a line below the table or ''.
-    """
-    from fogros2 import plugin_system
-    return [plugin_system.load('fogros2.price', name)
-            for name in plugin_system.names('fogros2.price')]
 
 
 def cloud_names() -> list[str]:
