@@ -36,7 +36,6 @@ class MachineType:
     :param gpus: number of GPUs, with ``gpu_memory_gb`` GiB each.
     :param gpu: manufacturer and name, such as 'NVIDIA T4'.
     :param spot: whether it exists as a spot machine.
-    :param disk_gb: size of the disk that belongs to it; 0 if a machine's disk has any size.
     """
 
     name: str
@@ -49,4 +48,3 @@ class MachineType:
     gpu: str = ''
     gpu_memory_gb: float = 0.0
     spot: bool = False
-    disk_gb: int = 0

@@ -141,7 +141,7 @@ class Market:
 
     # -- choosing -------------------------------------------------------------------------
 
-    def kinds(self, region: str, options: VmOptions, disk_gb: int) -> list[str]:
+    def kinds(self, region: str, options: VmOptions) -> list[str]:
         """
         Return the types that meet the requirements of a machine, the cheapest first.
 
@@ -151,7 +151,7 @@ class Market:
             arch=options.arch or None, min_cpu=int(options.min_cpu) or None,
             min_memory_gb=options.min_memory_gb or None, cpu_type=options.cpu_type or None,
             gpu=options.gpu or None, gpu_memory_gb=options.gpu_memory_gb or None,
-            max_price=options.max_price, spot=options.spot, disk_size=disk_gb)
+            max_price=options.max_price, spot=options.spot)
         return [offer.type.name for offer in self.choose([region], wanted).offers]
 
     def offers(self, region: str, wanted: Wants, *, spot_too: bool = False) -> list[Offer]:

@@ -39,7 +39,6 @@ class Wants:
     :param spot: compare spot prices.
     :param cores: exact number of physical cores, as FogROS2 asks; None for any.
     :param threads_per_core: exact number, as FogROS2 asks; None for any.
-    :param disk_gb: minimum size of the disk in GB, 0 if nobody asks for one.
     """
 
     arch: str = ''
@@ -53,7 +52,6 @@ class Wants:
     spot: bool = False
     cores: Optional[int] = None
     threads_per_core: Optional[int] = None
-    disk_gb: int = 0
 
     def __str__(self) -> str:
         words = [f'{self.min_cpu} CPUs', f'{self.min_memory_gb:g} GB']
@@ -67,8 +65,6 @@ class Wants:
         if self.threads_per_core is not None:
             words.append(f"{self.threads_per_core} thread{'s' * (self.threads_per_core > 1)}"
                          ' a core')
-        if self.disk_gb:
-            words.append(f'a disk of {self.disk_gb} GB')
         if self.spot:
             words.append('spot')
         return ', '.join(words)
@@ -156,7 +152,6 @@ def wants(
     gpu: Union[bool, int, str, None] = None, gpu_memory_gb: Optional[float] = None,
     max_price: Union[Decimal, str, float, None] = None, spot: bool = False,
     cores: Optional[int] = None, threads_per_core: Optional[int] = None,
-    disk_size: Optional[float] = None,
 ) -> Wants:
     """
     Check the requirements of a launch file or a command line; see :class:`Wants`.
@@ -175,7 +170,6 @@ def wants(
                                  'there are x86_64, arm64 and any')
     for name, value in (('min_cpu', min_cpu), ('min_memory_gb', min_memory_gb), ('gpu', number),
                         ('gpu_memory_gb', gpu_memory_gb), ('cores', cores),
-                        ('disk_size', disk_size),
                         ('threads_per_core', threads_per_core)):
         if value is not None and not 0 <= value < 1_000_000:
             raise ConfigurationError(f'{name} can not be {value:g}',
@@ -183,8 +177,7 @@ def wants(
     return Wants(
         _ARCHITECTURES[architecture.lower()], MIN_CPU if min_cpu is None else int(min_cpu),
         MIN_MEMORY_GB if min_memory_gb is None else float(min_memory_gb), cpu_type or '', number,
-        named, float(gpu_memory_gb or 0), dollars(max_price), spot, cores, threads_per_core,
-        int(disk_size or 0))
+        named, float(gpu_memory_gb or 0), dollars(max_price), spot, cores, threads_per_core)
 
 
 def dollars(value: Union[Decimal, str, float, None]) -> Optional[Decimal]:
@@ -211,7 +204,6 @@ def fits(kind: MachineType, wanted: Wants) -> bool:
             and kind.memory_gb >= wanted.min_memory_gb
             and wanted.cpu_type.lower() in kind.cpu.lower()
             and (not wanted.spot or kind.spot)
-            and (not kind.disk_gb or kind.disk_gb >= wanted.disk_gb)
             and (not wanted.gpus or kind.gpus >= wanted.gpus and _is_gpu(kind, wanted))
             and (wanted.cores is None or kind.cores == wanted.cores)
             and (wanted.threads_per_core is None

@@ -14,7 +14,7 @@ from fogros2_features.prices.offers import Wants, wants
 
 #: Options that are requirements; see :func:`fogros2_features.prices.offers.wants`.
 WANTS = ('arch', 'min_cpu', 'min_memory_gb', 'cpu_type', 'gpu', 'gpu_memory_gb', 'max_price',
-         'spot', 'disk_size')
+         'spot')
 #: Number of offers to try; the cheapest of each other cloud comes in addition.
 TRIES = 6
 

@@ -119,6 +119,10 @@ def test_a_wrong_option_is_named_with_what_to_do(options, words):
 def test_machine_of_a_fleet_outlives_its_launch(words):
     options = {'fleet': [f'{KEY} robot two@lab:/x\n'], 'ssh_from': ['198.51.100.0/24']}
     assert Options.of(MachineSpec('gpu-box', 'aws', options, on_exit='keep')).fleet
+    for networks in ([], '2001:db8::/64'):
+        with pytest.raises(ConfigurationError, match='the networks .IPv4. of its robots'):
+            AWSProvider().check(MachineSpec(
+                'gpu-box', 'aws', {**options, 'ssh_from': networks}, on_exit='keep'))
     with pytest.raises(ConfigurationError, match='use the machine after the launch'):
         Options.of(MachineSpec('gpu-box', 'aws', options, **words))
 

@@ -128,6 +128,24 @@ def test_request_without_an_answer_is_made_again(
     assert asked == [0.0, 1.0, 3.0, 7.0][:attempts]
 
 
+def test_retry_comes_after_the_pause_that_the_cloud_names(monkeypatch):
+    clock, asked = Clock(), []
+    error = {'error': {'code': 429, 'message': 'x', 'errors': [{'reason': 'rateLimitExceeded'}]}}
+    answers = [
+        SimpleNamespace(status_code=429, content=b'{', json=lambda: error,
+                        headers={'Retry-After': '7'}),
+        SimpleNamespace(status_code=200, content=b'{}', json=dict, headers={})]
+
+    def request(*words, **options):
+        asked.append(clock.now)
+        return answers.pop(0)
+
+    monkeypatch.setattr(rest, '_session', lambda: SimpleNamespace(request=request))
+    monkeypatch.setattr(gcp.Account, 'token', lambda *_: 'secret')
+    gcp.Account().having(clock).call('GET', 'robots', 'looking')
+    assert asked == [0.0, 7.0]
+
+
 def test_certificate_that_does_not_hold_is_the_reason(monkeypatch):
     reason = '[SSL: CERTIFICATE_VERIFY_FAILED] certificate is not yet valid'
     tls = urllib3.exceptions.SSLError(reason)

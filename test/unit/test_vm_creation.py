@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 import contextlib
 from decimal import Decimal
+import gzip
+import json
 import logging
 import threading
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Optional
 
 import pytest
 
@@ -18,7 +21,16 @@ from fogros2.provider import TAG_NAME, TAG_ROBOT
 from fogros2.provider.aws.cloud import Ec2
 from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.vm import provider
-from fogros2.provider.vm.cloud import CloudError, Place, TAG_ATTEMPT, TAG_MADE, VmCloud
+from fogros2.provider.vm.cloud import (
+    CloudError,
+    Order,
+    Place,
+    TAG_ATTEMPT,
+    TAG_MADE,
+    Vm,
+    VmCloud,
+    VmId,
+)
 from fogros2.provider.vm.creation import Creation
 from fogros2.provider.vm.options import VmOptions
 
@@ -29,6 +41,23 @@ class Options(VmOptions):
     DEFAULT_TYPE = 'small'
 
 
+def create(
+    insert: Callable[..., str], zones: Sequence[str] = ('a', 'b'), price: str = '0.05',
+    **options: Any,
+) -> VmId:
+    cloud: Any = SimpleNamespace(
+        title='Meadow', find=lambda *_: [], begin=lambda *_: None, insert=insert,
+        prepare=lambda region, order, types: dict.fromkeys(types),
+        places=lambda *_: zones,  # a sequence: an adapter need not write a generator
+        undo_begin=lambda *_: [], end_attempt=lambda *_: False,
+        end_command=lambda machine, tags: machine)
+    return Creation(
+        cloud, cloud, MachineSpec('planner', 'meadow', {}),
+        CreateRequest('token', 'key', {}, 1, agent_config={'launch': 'l1'}),
+        Options(region='north', **options), sources=lambda: [],
+        price=lambda *_: Decimal(price)).run(['north'])
+
+
 def test_full_zone_is_tried_once_for_each_type() -> None:
     tried: list[tuple[str, str]] = []
 
@@ -36,18 +65,36 @@ def test_full_zone_is_tried_once_for_each_type() -> None:
         tried.append((place.kind, place.zone))
         raise CloudError('full', 'wait', full='zone')
 
-    cloud: Any = SimpleNamespace(
-        title='Meadow', text_limit=0, boot='', find=lambda *_: [], begin=lambda *_: None,
-        insert=insert,
-        prepare=lambda region, order, types: dict.fromkeys(types),
-        places=lambda *_: ['a', 'b'],  # a list: an adapter need not write a generator
-        undo_begin=lambda *_: [], end_attempt=lambda *_: False)
-    creation = Creation(
-        cloud, cloud, MachineSpec('planner', 'meadow', {}), CreateRequest('token', 'key', {}, 1),
-        Options(region='north'), sources=lambda: [], price=lambda *_: None)
     with pytest.raises(CloudError, match='full'):
-        creation.run(['north'])
+        create(insert)
     assert tried == [(kind, zone) for kind in ('small', 'large', 'huge') for zone in ('a', 'b')]
+
+
+@pytest.mark.parametrize(('zones', 'limit', 'words'), [
+    ([], None, ''), (['a'], Decimal('0.01'), ' that is known to cost at most max_price=0.01')])
+def test_price_limit_is_named_if_it_excludes_all_types(
+    zones: list[str], limit: Optional[Decimal], words: str,
+) -> None:
+    with pytest.raises(CloudError) as caught:
+        create(lambda *_: '', zones, max_price=limit)
+    assert caught.value.args[0] == f'Meadow has no small or large or huge in north{words}'
+    assert caught.value.no_capacity
+
+
+def test_end_command_gets_the_id_of_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Ec2, 'end_command', lambda self, machine, tags: machine)
+    sent: list[bytes] = []
+
+    def insert(place: Place, order: Order, *others: Any) -> str:
+        sent.append(order.user_data)
+        return 'i-1'
+
+    region, vm, attempt = create(insert)
+    report = Vm(vm, region, MachineState.RUNNING, {TAG_ATTEMPT: attempt})
+    assert AWSProvider().machine_of(report).end_command == ('north', 'i-1', attempt)
+    # nobody knows the id before the machine exists
+    boot = json.loads(gzip.decompress(sent[0]).decode().partition('\n')[2])['bootcmd']
+    assert f'"end_command": ["north", "", "{attempt}"]' in boot[0][-1]
 
 
 def test_leftovers_are_old_or_of_dead_launches(caplog: pytest.LogCaptureFixture) -> None:

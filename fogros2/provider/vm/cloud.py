@@ -147,8 +147,7 @@ class Order:
 
     :param options: of the cloud's class, with the values for the region.
     :param tags: for the machine and every resource beside it.
-    :param sources: networks (CIDR) that may reach the SSH port; empty without the capability
-        ``firewall``.
+    :param sources: networks (CIDR) that may reach the SSH port.
     :param zone: where its volumes are, '' for any.
     """
 
@@ -224,8 +223,6 @@ class VmCloud(abc.ABC):
     id_form: ClassVar[str]
     #: Region for requests that belong to no region.
     base_region: ClassVar[str]
-    #: The most characters of user data that has to be text; 0 where a cloud takes any bytes.
-    text_limit: ClassVar[int] = 0
     #: A shell script that each machine runs at each boot, before its SSH server and agent.
     boot: ClassVar[str] = ''
     #: The usual price of a GB of a volume in US dollars a month, None without volumes.
@@ -400,9 +397,9 @@ class VmCloud(abc.ABC):
         :returns: whether there was one.
         """
 
+    @abc.abstractmethod
     def set_firewall(self, machine: VmId, port: int, sources: Sequence[str]) -> None:
         """Let only ``sources`` (CIDR) reach a TCP port of a machine; none closes it."""
-        raise Unsupported(f'{self.title} has no firewall')
 
     @abc.abstractmethod
     def set_tags(self, machine: VmId, tags: Mapping[str, str]) -> None:

@@ -132,7 +132,7 @@ class Creation:
             name=self.spec.name, user=options.user,
             authorized_keys=[self.request.authorized_key, *options.fleet],
             host_key=one_time(self.request.token), agent_config=agent,
-            boot=self.cloud.boot), self.cloud.text_limit)
+            boot=self.cloud.boot))
 
     def _make(self, region: str, order: Order, prepared: Mapping[str, Any]) -> VmId:
         created: list[str] = []

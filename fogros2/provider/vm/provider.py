@@ -108,11 +108,7 @@ class VmProvider(Provider):
 
     def check(self, spec: MachineSpec) -> None:
         options = self.cloud.options.of(spec)
-        if options.ssh_from and not self.capabilities.firewall:
-            raise ConfigurationError(
-                f'{self.cloud.title} has no firewall that could keep others out',
-                'leave ssh_from= out')
-        if options.fleet and self.capabilities.firewall and not ipv4(options.ssh_from):
+        if options.fleet and not ipv4(options.ssh_from):
             raise ConfigurationError('fleet= needs the networks (IPv4) of its robots',
                                      "ssh_from=['198.51.100.0/24'] names one")
         self.cloud.account(options).check_credentials()
@@ -137,14 +133,11 @@ class VmProvider(Provider):
                 chosen['regions'] = [one for one in self.cloud.regions.neighbours(region)
                                      if among is None or one in among]
         options = options.in_region(region)
-        kind, disk = options.named_type, spec.options.get('disk_size') and options.disk_size or 0
-        cloud = self.cloud.account(options).until(self.cancel)
+        kind, cloud = options.named_type, self.cloud.account(options).until(self.cancel)
         if options.chooses_type:
-            kind, *others = _market(cloud).kinds(region, options, disk)
+            kind, *others = _market(cloud).kinds(region, options)
             # if there is no capacity for the cheapest, the next cheapest are tried
             chosen[options.TYPES] = list(options.further_types) or others[:2]
-        elif disk:
-            self._check_disk(region, options)
         kind = kind or options.DEFAULT_TYPE
         if options.max_price is not None and not options.chooses_type:
             _market(cloud).check(region, kind, options)
@@ -152,15 +145,6 @@ class VmProvider(Provider):
         if not isinstance(spec.options.get(options.TYPE), Mapping):
             chosen[options.TYPE] = kind
         return dataclasses.replace(spec, options={**spec.options, **chosen, 'region': region})
-
-    def _check_disk(self, region: str, options: VmOptions) -> None:
-        """Check that no type has a fixed disk that is smaller than ``disk_size``."""
-        for kind in self.cloud.account(options).until(self.cancel).named_types(
-                region, options.types):
-            if 0 < kind.disk_gb < options.disk_size:
-                raise ConfigurationError(
-                    f'{kind.name} in {region} has a disk of {kind.disk_gb} GB, and disk_size= '
-                    f'asks for {options.disk_size}', 'ask for less, or name another type')
 
     def choices(self, spec: MachineSpec, chosen: MachineSpec) -> list[str]:
         """Describe type and region, and what is tried if there is no capacity."""
@@ -206,28 +190,21 @@ class VmProvider(Provider):
         if options.chooses_type or self._region(options) == NEAREST:
             spec = self.resolve(spec)
             options = self.cloud.options.of(spec)
-        cloud, firewall = self.cloud.account(options), self.capabilities.firewall
+        cloud = self.cloud.account(options)
         regions = list(dict.fromkeys([self._region(options), *options.regions]))
         zone = ''
         if request.with_volumes:
             regions, zone = _beside(cloud.until(cancel), regions, request.with_volumes)
         creation = Creation(
             cloud.until(cancel), cloud, spec, request, options,
-            sources=lambda: _ROBOT_ADDRESS.with_ipv6(
-                [self._address(cancel)]) if firewall else [],
+            sources=lambda: _ROBOT_ADDRESS.with_ipv6([self._address(cancel)]),
             price=functools.cache(
                 lambda region, kind: self._price(region, kind, options, cancel)), zone=zone)
         machine = creation.run(regions)
         cloud.notes[machine.vm] += map(str, creation.undo_failures)
-        if not firewall:
-            cloud.notes[machine.vm].append(
-                f'warning: its SSH port is open to the world, because {cloud.title} has no '
-                'firewall')
         return self._text(machine)
 
     def adopt(self, machine_id: str, spec: MachineSpec, tags: Mapping[str, str]) -> None:
-        if not self.capabilities.adopt:
-            return
         machine, cloud = self.vm_id(machine_id), self.until()
         cloud.set_tags(machine, tags)
         cloud.set_ending(machine, spec)
@@ -343,16 +320,13 @@ class VmProvider(Provider):
     # -- its network ----------------------------------------------------------------------------
 
     def robot_address(self) -> str:
-        return self._address(self._cancel()) if self.capabilities.firewall \
-            else super().robot_address()
+        return self._address(self._cancel())
 
     def _address(self, cancel: Optional[threading.Event]) -> str:
         return cancellable(_ROBOT_ADDRESS, cancel, what="asking for the robot's address",
                            grace=lambda: 0.0)
 
     def allow(self, machine_id: str, port: int, sources: Sequence[str]) -> None:
-        if not self.capabilities.firewall:
-            super().allow(machine_id, port, sources)
         # a port is closed even if the launch ends
         cloud = self.until() if sources else self.cloud
         cloud.set_firewall(self.vm_id(machine_id), port, _ROBOT_ADDRESS.with_ipv6(sources))

@@ -107,18 +107,16 @@ apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends \\
 """
 
 
-def user_data(config: Mapping[str, Any], text_limit: int = 0) -> bytes:
+def user_data(config: Mapping[str, Any]) -> bytes:
     """
     Return a #cloud-config as user data; the same bytes for the same one.
 
-    :param text_limit: the most bytes of a text (ASCII); 0 for compressed user data.
     :raises ProviderError: longer than the limit of the clouds.
     """
-    text = f'#cloud-config\n{json.dumps(config)}'.encode()
-    data, limit = (text, text_limit) if text_limit else (gzip.compress(text, 9, mtime=0), LIMIT)
-    if len(data) > limit:
+    data = gzip.compress(f'#cloud-config\n{json.dumps(config)}'.encode(), 9, mtime=0)
+    if len(data) > LIMIT:
         raise ProviderError(f"the user data of '{config['hostname']}' has {len(data)} bytes, and "
-                            f'the cloud takes {limit}', 'name fewer keys in fleet=')
+                            f'the cloud takes {LIMIT}', 'name fewer keys in fleet=')
     return data
 
 
