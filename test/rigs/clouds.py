@@ -20,11 +20,9 @@ from fogros2.waiting import wait_until
 from rigs.computers.box import Box, Call, Instance
 from rigs.launched import Launched, ros2
 
-#: A talker on a machine, and a listener on the robot, which says so when the machine goes.
+#: A talker on a machine, and a listener on the robot.
 LAUNCH = '''\
-from fogros2 import {machine}, CloudNode, FogROSLaunchDescription, MachineInterrupted
-from launch import EventHandler
-from launch.actions import LogInfo, RegisterEventHandler
+from fogros2 import {machine}, CloudNode, FogROSLaunchDescription
 from launch_ros.actions import Node
 
 
@@ -32,9 +30,6 @@ def generate_launch_description():
     machine = {machine}(name={name!r}, robot_timeout=6, **{options!r})
     words = {{'package': 'fogros2_examples', 'output': 'screen'}}
     return FogROSLaunchDescription([
-        RegisterEventHandler(EventHandler(
-            matcher=lambda event: isinstance(event, MachineInterrupted),
-            entities=[LogInfo(msg='on our own')])),
         CloudNode(machine=machine, executable='talker', **words),
         Node(executable='listener', **words),
     ])
@@ -59,11 +54,8 @@ class Cloud(abc.ABC):
     checked: ClassVar[str] = ''
     #: The most requests of a listing over all regions.
     listing: ClassVar[int]
-    #: Actions of requests that create something, and the pattern of the one for a machine.
-    creating: ClassVar[frozenset[str]]
+    #: The pattern of the request for a machine.
     order: ClassVar[str]
-    #: Mistakes of a user: words of the message, launch arguments, variables.
-    mistakes: ClassVar[Sequence[tuple[str, Sequence[str], Mapping[str, str]]]]
 
     @abc.abstractmethod
     def open(self, **words: Any) -> Box:
@@ -191,12 +183,7 @@ class Aws(Cloud):
     places = ({'region': 'us-east-1'},
               {'region': 'eu-central-1', 'ec2_instance_type': 'c5.large'})
     listing = 72  # twice, for machines and volumes: the regions, and one request for each
-    creating = frozenset({'RunInstances', 'ImportKeyPair', 'CreateSecurityGroup'})
     order = 'Action=RunInstances'
-    mistakes = (
-        ('xx-nowhere-1', ['region:=xx-nowhere-1'], {}),
-        ('credentials', [], {'AWS_ACCESS_KEY_ID': ''}),
-        ('does not answer', [], {'AWS_ENDPOINT_URL': 'http://198.51.100.1:9'}))
 
     def open(self, **words: Any) -> Box:
         """Return a box."""
@@ -295,13 +282,7 @@ class Gcp(Cloud):
               {'zone': 'europe-west3-b', 'machine_type': 'n2-standard-2'})
     checked = 'gcp: project robots, us-central1'
     listing = 2
-    creating = frozenset({'instances.insert', 'firewalls.insert'})
     order = '^POST .*/instances '
-    mistakes = (
-        ('there is no such file', [], {'GOOGLE_APPLICATION_CREDENTIALS': '/nowhere'}),
-        ('does not answer', [], {
-            'CLOUDSDK_API_ENDPOINT_OVERRIDES_COMPUTE': 'http://198.51.100.1:9/'}),
-        ("can't be the region", ['region:=nowhere'], {}))
 
     def __init__(self, project: str = 'robots') -> None:
         self._project = project
@@ -369,13 +350,7 @@ class Azure(Cloud):
     region, kind, price = 'westeurope', 'Standard_B2als_v2', '0.0376'
     places = ({'region': 'westeurope'}, {'region': 'eastus', 'vm_size': 'Standard_D2s_v5'})
     listing = 3
-    creating = frozenset({'PUT'})
     order = '^PUT .*/virtualMachines/[^/]* '
-    mistakes = (
-        ('no subscription', [], {'AZURE_SUBSCRIPTION_ID': ''}),
-        ('does not answer', [], {'FOGROS2_AZURE_ENDPOINT': 'http://198.51.100.1:9'}),
-        ('Azure has no Standard_X1', ['vm_size:=Standard_X1'], {}),
-        ("can't be the region", ['region:=West-Europe'], {}))
 
     def open(self, **words: Any) -> Box:
         """Return a box."""
