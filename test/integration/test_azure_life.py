@@ -451,15 +451,6 @@ def test_service_that_does_not_answer_is_one_line(robot, monkeypatch):
         Robot(robot.azure).create()
 
 
-def test_list_of_several_pages_is_read_to_its_end(robot):
-    made = [robot.provider.create(robot.spec(name), robot.request())
-            for name in ('planner', 'mapper', 'seer')]
-    robot.azure.page = 2
-    assert sorted(machine.id for machine in robot.provider.find({})) == sorted(made)
-    for machine_id in made:
-        robot.provider.destroy(machine_id)
-
-
 def test_another_server_gets_no_token(robot, monkeypatch):
     answer = robot.azure.answer
 

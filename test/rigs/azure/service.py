@@ -23,7 +23,7 @@ import re
 import threading
 import time
 from typing import Any, Optional
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import parse_qsl, urlsplit
 import uuid
 
 from rigs.azure import catalogue, schema
@@ -155,8 +155,6 @@ class Service:
         #: The actions that requests have needed.
         self.actions: set[str] = set()
         self.restricted: set[str] = set()
-        #: The most entries of a list in one answer.
-        self.page = 1000
         self.lock = threading.RLock()
 
     # -- requests -------------------------------------------------------------------------------
@@ -183,7 +181,6 @@ class Service:
                         {'Retry-After': '1'} if fault.status == 429 else {}))
                 found = self._route(method, path, kind, query, body, who, fault)
                 self._check_answer(kind, found[2])
-                found = self._paged(path, query, found)
                 if fault is not None and fault.after:
                     raise Refusal(500, fault.code)
                 code = ''
@@ -209,18 +206,6 @@ class Service:
             *more.items(), ('Content-Type', 'application/json'),
             ('Content-Length', str(len(data)))])
         return [data]
-
-    def _paged(
-        self, path: str, query: Mapping[str, str], answer: tuple[int, dict[str, str], Any],
-    ) -> tuple[int, dict[str, str], Any]:
-        """Return a page of a list, with the link to the next one."""
-        status, headers, found = answer
-        start = int(query.get('$skiptoken', 0))
-        if not isinstance(found, Mapping) or len(found.get('value', ())) <= self.page + start:
-            return status, headers, found if not start else {'value': found['value'][start:]}
-        more = urlencode({**query, '$skiptoken': start + self.page})
-        return status, headers, {'value': found['value'][start:start + self.page],
-                                 'nextLink': f'{self.url}{path}?{more}'}
 
     def _check_answer(self, kind: str, answer: Any) -> None:
         """Compare an answer with the models of the SDK: a defect of this service."""
