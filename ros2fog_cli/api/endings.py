@@ -59,8 +59,10 @@ def check_free(entry: Entry, *, force: bool) -> None:
         raise NameTaken(f"the launch with process {record.pid} has the machine '{entry.name}'",
                         'end that launch, or delete with --force')
     if entry.machine is not None and is_another_robot(record.robot):
-        raise NameTaken(f"the machine '{entry.name}' belongs to the robot {record.robot}",
-                        'delete it there, or with --force')
+        raise NameTaken(
+            f"the machine '{entry.name}' belongs to the robot {record.robot}: the state folder is "
+            'a copy, or this computer has another network card',
+            'delete it there, or with --force')
 
 
 def delete(entry: Entry, store: Store, report: Reporter, *, force: bool = False) -> None:

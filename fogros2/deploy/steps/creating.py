@@ -90,7 +90,7 @@ class Creation(Step):
             raise NameTaken(
                 f"the machine '{job.name}' belongs to the robot {before.robot}: the state folder "
                 'is a copy, or this computer has another network card',
-                f'give the machine another name=, or: ros2 fog delete {job.name}')
+                f'give the machine another name=, or: ros2 fog delete --force {job.name}')
         own = before.launch == context.launch_id
         if before.launch_alive and not own:
             raise NameTaken(
