@@ -274,6 +274,7 @@ class Provider(abc.ABC):
 
         A second call with the same ``request.token`` returns the same machine.
 
+        :param spec: with the capability ``choices``, a result of :meth:`resolve`.
         :raises NameTaken: a machine of this name exists, created with another token.
         :raises ProviderError: refused; nothing is left behind. ``refused`` of the error is False
             if a machine may exist in spite of it.

@@ -187,9 +187,6 @@ class VmProvider(Provider):
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         cancel, options = self.cancel, self.cloud.options.of(spec)
-        if options.chooses_type or self._region(options) == NEAREST:
-            spec = self.resolve(spec)
-            options = self.cloud.options.of(spec)
         cloud = self.cloud.account(options)
         regions = list(dict.fromkeys([self._region(options), *options.regions]))
         zone = ''
