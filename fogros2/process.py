@@ -105,7 +105,7 @@ def ask_for_ticket(what: str) -> bool:
     return subprocess.run(('sudo', '-v', '-p', prompt), env=_ENVIRONMENT).returncode == 0
 
 
-def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
+def sudo_trouble() -> tuple[str, str] | None:
     """
     Return why sudo refuses at the moment, and the remedy; None if it does not refuse.
 
@@ -113,13 +113,13 @@ def sudo_trouble(*, timeout: float = 10.0) -> tuple[str, str] | None:
     """
     if os.geteuid() == 0:
         return None
-    result = run(Command(('true',), sudo=True), timeout=timeout, check=False)
+    result = run(Command(('true',), sudo=True), timeout=10.0, check=False)
     if result.returncode == 0:
         return None
     text = result.stderr
     if 'password is required' in text:
         # sudo gives this reason to users without rights, too; ``sudo -v`` distinguishes them
-        text = run(Command(('sudo', '-n', '-v'), environment={'LC_ALL': 'C'}), timeout=timeout,
+        text = run(Command(('sudo', '-n', '-v'), environment={'LC_ALL': 'C'}), timeout=10.0,
                    check=False).stderr or text
     if 'password is required' in text or 'terminal is required' in text:
         return PASSWORD

@@ -37,8 +37,6 @@ from fogros2.waiting import Timeouts
 from ros2fog_cli.api import machines, reach
 from ros2fog_cli.api.machines import Entry
 
-#: Seconds for which gc keeps a stopped machine by default; see ``--keep-stopped``.
-KEEP_STOPPED = 7 * 86400.0
 #: Seconds after the end of its lifetime in which a machine may still be deleting itself.
 GRACE = 60.0
 #: Age in seconds after which gc deletes a launch's folder that has no process file.

@@ -284,15 +284,11 @@ def gather(
     warn: Warn, regions: Optional[Sequence[str]], ask: Callable[[str], Iterable[T]],
 ) -> list[T]:
     """Return what ``ask(name)`` yields for all providers that are configured here."""
-    found: dict[str, list[T]] = {name: [] for name in configured(regions)}
+    found: dict[str, list[T]] = {name: [] for name in plugin_system.names('fogros2.provider')
+                                 if wanted(name, regions)}
     # one that fails has answered in part, perhaps
     ask_all(warn, [*found], lambda name: found[name].extend(ask(name)))
     return [each for answer in found.values() for each in answer]
-
-
-def configured(regions: Optional[Sequence[str]]) -> list[str]:
-    """Return the providers to ask for more than the machines that this robot's records name."""
-    return [name for name in plugin_system.names('fogros2.provider') if wanted(name, regions)]
 
 
 def wanted(name: str, regions: Optional[Sequence[str]]) -> bool:

@@ -498,7 +498,7 @@ def test_gc_ends_machines_that_nobody_needs(
     if record_changes is not None:
         known = record('a', **(alive() if record_changes == 'alive' else record_changes))
     entry = Entry('a', 'memory', found, known)
-    said = endings.why_end(entry, NOW, endings.KEEP_STOPPED)
+    said = endings.why_end(entry, NOW, 7 * 86400.0)
     assert said.startswith(reason) and bool(said) == bool(reason)
 
 
@@ -684,9 +684,9 @@ def test_lifetime_of_a_reused_machine_starts_again() -> None:
     made = machine('a', expires=NOW - 3600)
     entry = Entry('a', 'memory', made, record('a', on_exit='keep', launch='', armed=NOW - 60))
     assert entry.expires == NOW - 60 + entry.record.spec.lifetime
-    assert endings.why_end(entry, NOW, endings.KEEP_STOPPED) == ''
+    assert endings.why_end(entry, NOW, 7 * 86400.0) == ''
     assert 'lifetime' in endings.why_end(
-        dataclasses.replace(entry, record=None), NOW, endings.KEEP_STOPPED)
+        dataclasses.replace(entry, record=None), NOW, 7 * 86400.0)
 
 
 def test_machine_that_a_search_omits_is_not_gone() -> None:

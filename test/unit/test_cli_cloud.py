@@ -283,7 +283,7 @@ def test_gc_uses_the_providers_time_of_the_stop(
                    stopped=stopped, expires=NOW - 59 * 86400)
     entry = Entry('slam', 'cloud', made, None)
     since = endings.stopped_at(made, None, Store())
-    assert bool(endings.why_end(entry, NOW, endings.KEEP_STOPPED, since)) is ends
+    assert bool(endings.why_end(entry, NOW, 7 * 86400.0, since)) is ends
 
 
 def test_gc_tidies_up_providers(

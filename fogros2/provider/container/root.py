@@ -56,6 +56,9 @@ _SECRET = re.compile(
 #: A user and a password in a URL, as in apt's sources.
 _URL_LOGIN = re.compile(rb'://[^/\s:@]+:[^/\s@]+@')
 
+#: The mounts of this computer, in the order of mounting.
+_MOUNTS = Path('/proc/self/mountinfo')
+
 _FOLDERS: Mapping[str, int] = {
     'dev': 0o755, 'etc/init.d': 0o755, 'home': 0o755, 'media': 0o755, 'mnt': 0o755,
     'opt': 0o755, 'proc': 0o555, 'root': 0o711, 'run': 0o755, 'run/lock': 0o1777,
@@ -129,7 +132,7 @@ def system_mounts(base: str = '') -> tuple[str, ...]:
     else:
         mounts += [PACKAGES] if os.path.isdir(PACKAGES) else []
         # An overlay does not show other file systems that are mounted in it.
-        mounts += [point for point in mount_points() if point.startswith('/usr/')]
+        mounts += [point for point, _ in _mounts(_MOUNTS) if point.startswith('/usr/')]
     return (*mounts, *(path[len(base):] for path in many_settings(f'{base}/etc')))
 
 
@@ -169,12 +172,7 @@ def _fit(path: str) -> bool:
     return stat.S_ISLNK(mode) or stat.S_ISDIR(mode) and mode & 0o5 == 0o5
 
 
-def mount_points(table: Path = Path('/proc/self/mountinfo')) -> list[str]:
-    """Return the mount points of this computer, in the order of mounting."""
-    return [point for point, _ in _mounts(table)]
-
-
-def file_system(path: Path, table: Path = Path('/proc/self/mountinfo')) -> str:
+def file_system(path: Path, table: Path = _MOUNTS) -> str:
     """Return the type of the file system of ``path``, which need not exist."""
     name = os.path.realpath(path)
     kind, longest = '', -1
