@@ -261,7 +261,7 @@ def _what(command: Command) -> str:
     return command.what or command.argv[0]
 
 
-def _feed(channel: Channel, data: bytes, *, end: bool = True) -> Optional[threading.Thread]:
+def _feed(channel: Channel, data: bytes, *, end: bool) -> Optional[threading.Thread]:
     def send() -> None:
         rest = memoryview(data)
         # The command may end before it reads all input; its exit status has the reason.

@@ -328,7 +328,7 @@ def explained(
         # The receiver may exit before rsync has read its error message.
         return ShellError(f'the disk of {where} is full, or fails: {source} was not written there',
                           'make room there, or leave more out')
-    if 'command not found' in text or 'remote command not found' in text:
+    if 'command not found' in text:
         return missing_there(where)
     if 'Host key verification failed' in text:
         return HostKeyError(f'the host key of {where} has changed, so {source} was not sent',
