@@ -42,20 +42,21 @@ class Options(VmOptions):
 
 
 def create(
-    insert: Callable[..., str], zones: Sequence[str] = ('a', 'b'), price: str = '0.05',
+    insert: Callable[..., str], zones: Sequence[str] = ('a', 'b'), price: Optional[str] = '0.05',
+    regions: Sequence[str] = ('north',), end_attempt: Callable[..., bool] = lambda *_: False,
     **options: Any,
 ) -> VmId:
     cloud: Any = SimpleNamespace(
         title='Meadow', find=lambda *_: [], begin=lambda *_: None, insert=insert,
         prepare=lambda region, order, types: dict.fromkeys(types),
         places=lambda *_: zones,  # a sequence: an adapter need not write a generator
-        undo_begin=lambda *_: [], end_attempt=lambda *_: False,
+        undo_begin=lambda *_: [], end_attempt=end_attempt,
         end_command=lambda machine, tags: machine)
     return Creation(
         cloud, cloud, MachineSpec('planner', 'meadow', {}),
         CreateRequest('token', 'key', {}, 1, agent_config={'launch': 'l1'}),
         Options(region='north', **options), sources=lambda: [],
-        price=lambda *_: Decimal(price)).run(['north'])
+        price=lambda *_: None if price is None else Decimal(price)).run([*regions])
 
 
 def test_full_zone_is_tried_once_for_each_type() -> None:
@@ -142,15 +143,8 @@ def test_machine_of_a_region_before_may_exist() -> None:
             raise ProviderError('no answer')
         return False
 
-    cloud: Any = SimpleNamespace(
-        title='Meadow', text_limit=0, find=lambda *_: [], begin=lambda *_: None, insert=insert,
-        prepare=lambda region, order, types: dict.fromkeys(types), places=lambda *_: ['a'],
-        undo_begin=lambda *_: [], end_attempt=end_attempt)
-    creation = Creation(
-        cloud, cloud, MachineSpec('planner', 'meadow', {}), CreateRequest('token', 'key', {}, 1),
-        Options(region='north'), sources=lambda: [], price=lambda *_: None)
     with pytest.raises(CloudError, match='full') as caught:
-        creation.run(['north', 'south'])
+        create(insert, regions=['north', 'south'], end_attempt=end_attempt)
     assert caught.value.refused is False and len(caught.value.undo_failures) == 1
 
 
@@ -163,14 +157,6 @@ def test_type_of_unknown_price_is_above_any_limit(spot: bool, tried: list[str]) 
         found.append(place.kind)
         return 'm-1'
 
-    cloud: Any = SimpleNamespace(
-        title='Meadow', text_limit=0, find=lambda *_: [], begin=lambda *_: None, insert=insert,
-        prepare=lambda region, order, types: dict.fromkeys(types), places=lambda *_: ['a'],
-        undo_begin=lambda *_: [], end_attempt=lambda *_: False)
-    creation = Creation(
-        cloud, cloud, MachineSpec('planner', 'meadow', {}), CreateRequest('token', 'key', {}, 1),
-        Options(region='north', spot=spot, max_price=Decimal(1)), sources=lambda: [],
-        price=lambda *_: None)
     with contextlib.nullcontext() if spot else pytest.raises(CloudError, match='max_price=1'):
-        creation.run(['north'])
+        create(insert, price=None, spot=spot, max_price=Decimal(1))
     assert found == tried
