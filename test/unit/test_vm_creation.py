@@ -47,7 +47,7 @@ def create(
     **options: Any,
 ) -> VmId:
     cloud: Any = SimpleNamespace(
-        title='Meadow', find=lambda *_: [], begin=lambda *_: None, insert=insert,
+        title='Meadow', boot='', find=lambda *_: [], begin=lambda *_: None, insert=insert,
         prepare=lambda region, order, types: dict.fromkeys(types),
         places=lambda *_: zones,  # a sequence: an adapter need not write a generator
         undo_begin=lambda *_: [], end_attempt=end_attempt,
