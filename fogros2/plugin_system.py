@@ -6,7 +6,8 @@ from __future__ import annotations
 import functools
 from typing import Any, TYPE_CHECKING
 
-from fogros2.errors import ConfigurationError, did_you_mean, PrerequisiteError
+from fogros2.errors import ConfigurationError, did_you_mean, FogError, PrerequisiteError
+from fogros2.untrusted import clean
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -48,7 +49,7 @@ def load(group: str, name: str) -> Any:
     Import the object of the entry point ``name`` in ``group``, and return it.
 
     :raises ConfigurationError: no such plugin; the hint names the nearest.
-    :raises PrerequisiteError: a dependency of the plugin is not installed.
+    :raises PrerequisiteError: a dependency of the plugin is not installed, or its module fails.
     """
     points = _entry_points(group)
     if name not in points:
@@ -66,6 +67,17 @@ def load(group: str, name: str) -> Any:
                 f'install a version of {dist.name} that is for this version of FogROS2'
         raise PrerequisiteError(
             f"the {_kind(group)} '{name}' can't be loaded: {error}", remedy) from error
+    except Exception as error:  # one defective plugin must not end the others
+        point = points[name]
+        version = f'{point.dist.name} {point.dist.version}' if point.dist else point.value
+        raise PrerequisiteError(
+            f"the {_kind(group)} '{name}' of {version} can't be loaded: {cause(error)}",
+            f"python3 -c 'import {point.module}' shows where") from error
+
+
+def cause(error: Exception) -> str:
+    """Return a line about an error of a plugin: for an unexpected one with its kind."""
+    return str(error) if isinstance(error, FogError) else clean(f'{type(error).__name__}: {error}')
 
 
 def _kind(group: str) -> str:

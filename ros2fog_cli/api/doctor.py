@@ -100,8 +100,9 @@ def provider(name: str, *, needed: bool = False, timeout: float = TIMEOUT) -> Ch
         answer = _in_time(lambda: kind().answers(), timeout)
     except Unsupported:
         return Check(title, 'ok', 'is there' if needed else '')
-    except FogError as error:
-        return Check(title, wrong, str(error.args[0]), error.hint)
+    except Exception as error:  # noqa: BLE001 - a plugin's defect must not hide the other checks
+        return Check(title, wrong, str(error.args[0]), error.hint) \
+            if isinstance(error, FogError) else Check(title, wrong, plugin_system.cause(error))
     if answer is None:
         return Check(title, wrong, f'no answer within {timeout:g} s',
                      'is there a way to the internet, and through a proxy?')

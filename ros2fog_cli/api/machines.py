@@ -272,8 +272,8 @@ def ask_all(
             return ask(name)
         except (Cancelled, Unsupported):
             return None  # Ctrl-C ends the whole program
-        except FogError as error:
-            warn(f'{name}: {error}')
+        except Exception as error:  # noqa: BLE001 - a plugin's defect must not hide the others
+            warn(f'{name}: {plugin_system.cause(error)}')
             return None
 
     with ThreadPoolExecutor(max(1, len(providers)), 'fog-ask') as pool:
@@ -293,14 +293,14 @@ def gather(
 
 def wanted(name: str, regions: Optional[Sequence[str]]) -> bool:
     """Return whether to ask a provider that no record of this robot names."""
-    if not regions and name in plugin_system.names('fogros2.configured'):
-        # This entry point answers without loading the provider, which takes long.
-        return bool(plugin_system.load('fogros2.configured', name)())
     try:
+        if not regions and name in plugin_system.names('fogros2.configured'):
+            # This entry point answers without loading the provider, which takes long.
+            return bool(plugin_system.load('fogros2.configured', name)())
         kind: type[Provider] = plugin_system.load('fogros2.provider', name)
-    except FogError:
-        return True  # the caller loads it again, and reports the error with the provider's name
-    return kind.configured() or bool(regions) and kind.capabilities.regions
+        return kind.configured() or bool(regions) and kind.capabilities.regions
+    except Exception:  # noqa: BLE001 - the caller asks it, and reports the error with its name
+        return True
 
 
 def record_of(machine: Machine, records: Mapping[str, Record]) -> Optional[Record]:

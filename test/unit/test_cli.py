@@ -554,6 +554,22 @@ def test_gc_fails_if_a_provider_does_not_answer(
     assert Store().exists('a')
 
 
+@pytest.mark.parametrize('method', ['__init__', 'configured', 'find'])
+def test_defect_of_a_provider_hides_no_other(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], method: str,
+) -> None:
+    def fail(*_: object) -> None:
+        raise KeyError('oops')
+
+    monkeypatch.setattr(Untagged, method, fail)
+    machine('a')
+    record('a', **dead())
+    machine('b')
+    assert run('delete', 'b', '-y') == 0 and run('gc') == 0
+    assert not Memory.machines
+    assert method == 'configured' or "untagged: KeyError: 'oops'\n" in capsys.readouterr().err
+
+
 def test_delete_leaves_a_computer_of_another_robot_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

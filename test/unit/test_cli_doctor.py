@@ -22,6 +22,8 @@ from fogros2 import process
 from fogros2.errors import PrerequisiteError, StoreError
 from fogros2.model import Result
 from fogros2.store import Store
+from fogros2_testing import FakeProvider
+from fogros2_testing.plugins import instead
 from ros2fog_cli.api import doctor, lan
 
 
@@ -189,6 +191,16 @@ def test_check_that_cannot_be_made_ends_no_other(monkeypatch: pytest.MonkeyPatch
     lan_check = checks['ROS 2 on the LAN']
     assert lan_check.verdict == 'failed' and lan_check.remedy == 'sudo apt-get install iproute2'
     assert checks['clocks'].verdict == 'failed' and 'Permission denied' in checks['clocks'].detail
+
+
+def test_defective_provider_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Older(FakeProvider):
+        def answers(self) -> str:
+            raise TypeError('answers() got an unexpected keyword argument')
+
+    instead(monkeypatch, 'fogros2.provider', {'older': Older})
+    check = doctor.provider('older')
+    assert check.verdict == 'warning' and check.detail.startswith('TypeError: answers() got')
 
 
 def test_state_folder_of_root_fails_its_checks(monkeypatch: pytest.MonkeyPatch) -> None:

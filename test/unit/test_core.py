@@ -66,15 +66,19 @@ def test_unknown_plugin_is_refused_with_a_suggestion():
         plugin_system.load('fogros2.provider', 'conteiner')
 
 
-def test_plugin_for_another_version_is_named(tmp_path, monkeypatch):
-    install(tmp_path, 'fogros2.feature', 'shelf', 'import fogros2.transport', 'Shelf')
+@pytest.mark.parametrize(('program', 'message', 'hint'), [
+    ('import fogros2.transport', 'fogros2.transport', 'install a version of fogt_shelf'),
+    ('1 / 0', 'of fogt_shelf 0 .* ZeroDivisionError: division by zero', 'import fogt_shelf'),
+    ('def', 'SyntaxError: .*fogt_shelf.py, line 1', 'import fogt_shelf')])
+def test_defective_plugin_is_named(tmp_path, monkeypatch, program, message, hint):
+    install(tmp_path, 'fogros2.feature', 'shelf', program, 'Shelf')
     monkeypatch.syspath_prepend(tmp_path)
     (found,) = metadata.distributions(path=[str(tmp_path)])
     monkeypatch.setattr(
         plugin_system, '_entry_points', lambda group: {p.name: p for p in found.entry_points})
-    with pytest.raises(errors.PrerequisiteError, match='fogros2.transport') as caught:
+    with pytest.raises(errors.PrerequisiteError, match=message) as caught:
         plugin_system.load('fogros2.feature', 'shelf')
-    assert 'fogt_shelf' in caught.value.hint and 'install FogROS2' not in caught.value.hint
+    assert hint in caught.value.hint and 'install FogROS2' not in caught.value.hint
 
 
 def test_json_of_the_model_is_plain():
