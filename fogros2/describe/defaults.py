@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 import contextlib
 import dataclasses
 import importlib
@@ -53,8 +53,8 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
         else:
             tables[''][name] = value
     for provider, table in tables.items():
-        allowed = {name: keyword for each in ([provider] if provider else keywords.providers())
-                   for name, keyword in _allowed(keywords.machine_class(each)).items()}
+        allowed = {name: keyword for cls in _classes(provider)
+                   for name, keyword in _allowed(cls).items()}
         for name, value in table.items():
             with values.named(str(path)):
                 _check_name(provider, name, value, allowed)
@@ -63,6 +63,11 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
                     check_setting(name, value)
                 features.own({name: value})
     return tables
+
+
+def _classes(provider: str) -> Iterable[type[CloudInstance]]:
+    """Return the classes of a provider's machines, '' for those of all providers."""
+    return [keywords.machine_class(provider)] if provider else keywords.machine_classes()
 
 
 def _check_name(provider: str, name: str, value: Any, allowed: Collection[str]) -> None:
@@ -76,8 +81,8 @@ def _check_name(provider: str, name: str, value: Any, allowed: Collection[str]) 
         return
     if not provider and isinstance(value, dict):
         keywords.machine_class(name)
-    for each in [provider] if provider else keywords.providers():
-        if name in keywords.keywords(keywords.machine_class(each)):
+    for cls in _classes(provider):
+        if name in keywords.keywords(cls):
             raise ConfigurationError(f"only a launch file can set '{name}'", 'take it out here')
     raise kinds.unknown(f'[{provider}]' if provider else 'a machine', name, allowed)
 

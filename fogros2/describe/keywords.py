@@ -17,7 +17,7 @@ from fogros2 import plugin_system
 from fogros2.describe import features, values
 from fogros2.describe.kinds import Keyword, names_of, parameters_of, unknown
 from fogros2.describe.machines import CloudInstance
-from fogros2.errors import ConfigurationError, did_you_mean
+from fogros2.errors import ConfigurationError, did_you_mean, PrerequisiteError
 
 #: Entry point group of the machines' classes, by provider.
 GROUP = 'fogros2.machine'
@@ -40,6 +40,7 @@ def machine_class(provider: str) -> type[CloudInstance]:
     Return the class of a provider's machines.
 
     :raises ConfigurationError: no such provider; the hint names the nearest one and all.
+    :raises PrerequisiteError: the class can't be loaded.
     """
     if provider == ROBOT:
         return Robot
@@ -48,6 +49,13 @@ def machine_class(provider: str) -> type[CloudInstance]:
                                  did_you_mean(provider, providers(), all_too=True))
     cls: type[CloudInstance] = plugin_system.load(GROUP, provider)
     return cls
+
+
+def machine_classes() -> Iterator[type[CloudInstance]]:
+    """Yield the classes of all providers but those that can't be loaded."""
+    for provider in providers():
+        with contextlib.suppress(PrerequisiteError):
+            yield machine_class(provider)
 
 
 def keywords(cls: type[CloudInstance]) -> Mapping[str, Keyword]:

@@ -27,7 +27,7 @@ from fogros2 import (
 )
 from fogros2.actions.frontend.entity import complete
 from fogros2.describe import keywords, values
-from fogros2.errors import ConfigurationError
+from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.runtime.coordinator import Coordinator
 from fogros2_testing.plugins import instead
 from rigs.launching import ends, Harmless
@@ -220,7 +220,9 @@ def test_container_on_another_computer():
       </fog_machine>"""), box='gpu-box') == expected
 
 
-def test_the_provider_may_be_a_substitution(run, fake):
+def test_the_provider_may_be_a_substitution(run, fake, monkeypatch):
+    instead(monkeypatch, 'fogros2.machine', {
+        **CLASSES, 'nosdk': PrerequisiteError('no module fancysdk')})
     there = {}
     description = load("""
 launch:

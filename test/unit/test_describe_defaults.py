@@ -18,6 +18,7 @@ from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.provider.aws.provider import AWSProvider
 from fogros2.provider.container import ContainerProvider
+from fogros2_testing.plugins import instead
 from ros2fog_cli.api import doctor
 
 pytestmark = pytest.mark.skipif(
@@ -69,6 +70,16 @@ memory = '2g'
                              'ssh_from': ['198.51.100.0/24']}
     assert spec(ContainerInstance(name='a')).options['memory'] == '2g'
     assert spec(SSHInstance(name='a', host='h')).lifetime == 7200.0
+
+
+def test_provider_without_its_library_breaks_no_other(own, monkeypatch):
+    instead(monkeypatch, 'fogros2.machine', {
+        'container': ContainerInstance, 'nosdk': PrerequisiteError('no module fancysdk')})
+    own.write_text("lifetime = '2h'\n")
+    assert spec(ContainerInstance(name='a')).lifetime == 7200.0
+    own.write_text("name = 'a'\n")
+    with pytest.raises(ConfigurationError, match='only a launch file'):
+        spec(ContainerInstance(name='a'))
 
 
 @pytest.mark.parametrize('lifetime', [28800, '8h', 28800.0, '1h'])

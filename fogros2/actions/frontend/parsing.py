@@ -47,8 +47,8 @@ def fog_machine(entity: Entity, parser: Parser) -> Parsed:
         parameters = dict(keywords.keywords(keywords.machine_class(provider)))
     else:
         # the provider is resolved when the action is executed: accept the keywords of all
-        parameters = {name: keyword for each in keywords.providers() if _loads(each)
-                      for name, keyword in keywords.keywords(keywords.machine_class(each)).items()}
+        parameters = {name: keyword for cls in keywords.machine_classes()
+                      for name, keyword in keywords.keywords(cls).items()}
     name = attribute(entity, parser, 'name')
     with naming(name if isinstance(name, str) else ''):
         given = _given(entity, parser, parameters)
@@ -73,15 +73,6 @@ def _items(entity: Entity, parser: Parser, names: Iterable[str]) -> dict[str, li
     """Return the items of features' lists by keyword, from child elements with these names."""
     return separate(
         parser.parse_action(child) for name in names for child in children(entity, name))[1]
-
-
-def _loads(provider: str) -> bool:
-    """Return whether a provider's class can be loaded."""
-    try:
-        keywords.machine_class(provider)
-    except ConfigurationError:
-        return False
-    return True
 
 
 def cloud_node(entity: Entity, parser: Parser) -> Parsed:
