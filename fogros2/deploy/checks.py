@@ -47,7 +47,21 @@ def check_here(
         for package, executable in programs:
             check_program(
                 package, executable, plan.ament_prefixes(environment), spec.workspace)
+    check_stop(spec, provider)
     provider.check_here(spec)
+
+
+def check_stop(spec: MachineSpec, provider: Provider) -> None:
+    """
+    Check that a machine can be stopped, if ``on_exit`` says so; of 'cheapest', when it is chosen.
+
+    :raises ConfigurationError: it cannot.
+    """
+    can = provider.capabilities
+    if spec.on_exit == 'stop' and not (can.stop or can.places):
+        raise ConfigurationError(
+            f"the provider '{spec.provider}' can't stop '{spec.name}' and start it again",
+            f"use on_exit='keep', or 'delete'{'' if can.owned else ' to leave nothing there'}")
 
 
 def check(
@@ -62,11 +76,8 @@ def check(
     :raises FogError: the first problem that was found, with its remedy.
     """
     shells.warm(provider.capabilities.shell_kind)
+    check_stop(spec, provider)
     provider.check(spec)
-    if spec.on_exit == 'stop' and not provider.capabilities.owned:
-        raise ConfigurationError(
-            f"'{spec.name}' is a computer that exists already: no launch switches it off",
-            "use on_exit='delete' to leave nothing there, or 'keep'")
     for each, own in feature.used(spec):
         each.check(spec, own)
     chain = [workspace.inspected(path) for path in spec.workspaces]

@@ -23,6 +23,7 @@ from fogros2.deploy.checks import (
     check_architecture,
     check_here,
     check_names,
+    check_stop,
     check_together,
 )
 from fogros2.deploy.choosing import Choices
@@ -180,6 +181,7 @@ class Launch:
 
     def _check_choices(self, place: MachineSpec) -> MachineSpec:
         """Make the open choices of a spec; check that wheels and workspace fit its processor."""
+        check_stop(place, self.provider(place.provider))
         chosen = self._choices.resolved(place)
         self._choices.expect(chosen, self._choices.price(chosen))
         check_architecture(chosen, self.provider(place.provider))

@@ -44,8 +44,8 @@ class Capabilities:
     """
     What a provider can do besides the four methods that every provider has.
 
-    A method of :class:`Provider` that needs a capability names it; without the capability, the
-    core does not call the method.
+    A method of :class:`Provider` that needs a capability names it. Without the capability, the
+    core does not call the method, or its default does nothing.
 
     :param shell_kind: name of the shell plugin that reaches its machines.
     :param owned: it creates machines for a launch; False for computers that exist already.

@@ -61,6 +61,7 @@ from fogros2.model import (
     Peer,
     Result,
 )
+from fogros2.provider import Capabilities
 from fogros2.report import Silence, StepDone, StepFailed, Warned
 from fogros2.shell import host_key
 from fogros2.store import Made, process_start, Store
@@ -187,11 +188,26 @@ def test_launch_without_a_port_for_a_daemon_of_ros2_begins(launch, monkeypatch):
     assert launch.programs() is None
 
 
-def test_computer_of_the_user_cannot_be_stopped(launch, checked, monkeypatch):
-    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=False))
+class Offers(FakeProvider):
+    """A provider that stands for the other one."""
+
+    capabilities = Capabilities(shell_kind='local', places=True)
+
+    def places(self, spec):
+        return [('fake', dataclasses.replace(spec, provider='fake'))]
+
+
+@pytest.mark.parametrize('owned', [True, False])
+@pytest.mark.parametrize('name', ['fake', 'offers'])
+def test_machine_that_cannot_be_stopped_is_refused(launch, checked, monkeypatch, owned, name):
+    instead(monkeypatch, 'fogros2.provider', {'fake': lambda: checked, 'offers': Offers})
+    monkeypatch.setattr(FakeProvider, 'capabilities', FakeProvider.can(owned=owned, stop=False))
     monkeypatch.setattr(deployed, 'check_robot', lambda: None)
-    with pytest.raises(ConfigurationError, match="'planner' is a computer that exists already"):
-        launch.prepare([dataclasses.replace(SPEC, on_exit='stop')])
+    spec = dataclasses.replace(SPEC, provider=name, on_exit='stop')
+    with pytest.raises(ConfigurationError, match="'fake' can't stop 'planner'"):
+        launch.check_here([spec])
+        launch.prepare([spec])
+    assert checked.calls == []
 
 
 def test_first_problem_ends_the_early_checks(launch, checked, monkeypatch):

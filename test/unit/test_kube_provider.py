@@ -370,12 +370,6 @@ def test_role_in_a_named_namespace_finds_its_pods(monkeypatch, places, regions, 
     assert sorted(searched) == regions
 
 
-def test_a_pod_can_not_be_asked_to_stop():
-    spec = MachineSpec('planner', 'kubernetes', on_exit='stop')
-    error = raised(ConfigurationError, lambda: KubernetesProvider().check(spec))
-    assert "on_exit='keep'" in error.hint
-
-
 #: What API servers have said, and a word that the remedy has to hold.
 REFUSALS = [
     ('jobs.batch is forbidden: User "robot" cannot create resource "jobs" in API group "batch" '

@@ -19,7 +19,6 @@ from typing import Any, ClassVar, Optional
 
 from fogros2 import kubernetes_client, untrusted
 from fogros2.errors import (
-    ConfigurationError,
     FogError,
     MachineNotFound,
     NameTaken,
@@ -99,10 +98,6 @@ class KubernetesProvider(Provider):
     def check(self, spec: MachineSpec) -> None:
         """Check the options, and this user's rights in the cluster."""
         options = Options.parse(spec.options)
-        if spec.on_exit == 'stop':
-            raise ConfigurationError(
-                f"'{spec.name}' is a pod, which can't be stopped and started again",
-                "use on_exit='keep' or 'delete'")
         api, namespace = self._place(options)
         self._lifetimes[names.job_name(spec.name)] = spec.lifetime
         self._once((api.context, namespace), lambda: self._check_rights(api, namespace))
