@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from fogros2.deploy.steps import watching
-from fogros2.errors import PrerequisiteError
+from fogros2.errors import FogError, PrerequisiteError
 from fogros2.provider.aws import clients, failures
 from fogros2.provider.azure import account as azure
 from fogros2.provider.gcp import account as gcp
@@ -144,6 +144,22 @@ def test_retry_comes_after_the_pause_that_the_cloud_names(monkeypatch):
     monkeypatch.setattr(gcp.Account, 'token', lambda *_: 'secret')
     gcp.Account().having(clock).call('GET', 'robots', 'looking')
     assert asked == [0.0, 7.0]
+
+
+@pytest.mark.parametrize(('status', 'repeatable', 'attempts'), [
+    (504, True, 8), (504, False, 1), (429, False, 8), (0, True, 2), (0, False, 1)])
+def test_request_that_cannot_be_repeated_is_made_once(status, repeatable, attempts):
+    asked = []
+
+    def send():
+        asked.append(status)
+        raise azure.refusal(status, None, 'creating it') if status else \
+            Silent('no answer', '', unsent=False)
+
+    with pytest.raises(FogError):
+        account.Account().having(Clock()).repeated(
+            send, 'creating it', reads=False, repeatable=repeatable)
+    assert len(asked) == attempts
 
 
 def test_certificate_that_does_not_hold_is_the_reason(monkeypatch):

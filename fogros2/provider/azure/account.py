@@ -182,7 +182,7 @@ class Account(RestAccount):
         """Make a request below the endpoint, which alone gets the token."""
         if _server(url) != _server(endpoint()):
             raise ProviderError(f'{what} failed: Azure named another server, {url[:100]}')
-        answer = self.ask(method, url, what, body, query=query, repeatable=method != 'POST')
+        answer = self.ask(method, url, what, body, query=query)
         self.clock.note(answer.headers.get('Date', ''))
         return answer
 

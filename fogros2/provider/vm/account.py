@@ -92,17 +92,18 @@ class Account:
                 return cancellable(ask, self.cancel, what=what, grace=patience)
             except (CodedError, Silent) as error:
                 sent = False
+                harmless = repeatable or error.refused
                 unsure = unsure or not error.refused
                 error.refused = not unsure
                 pause = min(LONGEST, PAUSE * 2 ** (attempt - 1) if error.pause is None
                             else error.pause)
                 if not isinstance(error, Silent):
-                    last = not error.temporary or self.hasty and attempt >= 2
+                    last = not error.temporary or not harmless or self.hasty and attempt >= 2
                 elif error.unsent:
                     end = end or time.monotonic() + UNSENT
                     last = self.hasty or time.monotonic() + pause > end
                 else:
-                    last = not repeatable or attempt >= 2
+                    last = not harmless or attempt >= 2
                 if last or attempt == ATTEMPTS:
                     raise
             except FogError as error:
