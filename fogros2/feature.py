@@ -146,7 +146,7 @@ class RunningMachine(ReachedMachine, Protocol):
         :param name: of the watch, not 'vpn' or 'notice'; an earlier one of this name ends.
         :param argv: its files are ``/run/INTERFACE.watch*``, which go with the VPN.
         :param then: called once, in a thread that must not wait, with what it has printed: text of
-            a machine, which is not trusted.
+            a machine, which is not trusted. An error that it raises is reported.
         """
 
     def give_up(self, reason: str) -> None:

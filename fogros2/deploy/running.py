@@ -21,7 +21,8 @@ from fogros2.deploy.undo import OPEN_PORT
 from fogros2.errors import AgentError, DeadlineExceeded, FogError
 from fogros2.events import Event, NodeStatus
 from fogros2.model import Machine, MachineSpec, NodeSpec, to_json
-from fogros2.report import Warned
+from fogros2.plugin_system import cause
+from fogros2.report import StepFailed, Warned
 from fogros2.waiting import wait_until
 
 
@@ -189,7 +190,11 @@ class RunningMachine(MachineJob):
             if event['event'] != 'watched':
                 callback(event)
             elif watched := self._watches.pop(event['what'], None):
-                watched.then(event['reason'])
+                try:
+                    watched.then(event['reason'])
+                except Exception as error:  # noqa: BLE001 - this thread reads all events
+                    self._context.report(StepFailed(
+                        self.name, f"watch '{event['what']}'", 0.0, cause(error), fatal=False))
 
         with self._lock:
             self._callback, life = callback, self.life

@@ -44,6 +44,7 @@ from fogros2.errors import (
     NameTaken,
     PrerequisiteError,
     ProviderError,
+    ShellError,
     StoreError,
     VpnError,
     WorkspaceError,
@@ -1095,6 +1096,23 @@ def test_idle_machine_that_ends_already_is_left_to_its_steps(launch, provider):
     for thread in (first, second):
         thread.result(60)
     assert steps == ['delete']
+
+
+@pytest.mark.parametrize('error', [ShellError('no number'), KeyError('oops')])
+def test_error_of_a_watch_is_reported_and_ends_no_other(launch, provider, events, error):
+    def then(text):
+        raise error
+
+    _, mine = begun(launch)
+    told, subscribed = [], []
+    mine.agent = Cut()
+    mine.agent.subscribe = lambda callback, since: subscribed.append(callback)
+    mine.watch('mine', (), 1.0, then)
+    mine.subscribe(told.append)
+    subscribed[0]({'event': 'watched', 'what': 'mine', 'reason': 'x'})
+    subscribed[0]({'event': 'exited', 'node': '1'})
+    assert [event['event'] for event in told] == ['exited']
+    assert [event.step for event in events if isinstance(event, StepFailed)] == ["watch 'mine'"]
 
 
 def heard(*silences):
