@@ -23,6 +23,9 @@ class TestFakeProvider(ProviderContract):
     def make(self):
         return FakeProvider(polls=2), {'size': 'small'}
 
+    def another(self, provider, spec):
+        return provider  # its machines are entries of this object
+
 
 class CloudLike(FakeProvider):
     """One with a firewall, and with host keys that are handed over."""
@@ -30,7 +33,7 @@ class CloudLike(FakeProvider):
     capabilities = FakeProvider.can(firewall=True, one_time_host_key=True)
 
 
-class TestFakeCloud(ProviderContract):
+class TestFakeCloud(TestFakeProvider):
 
     @pytest.fixture(autouse=True)
     def one(self):

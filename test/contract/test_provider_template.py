@@ -22,7 +22,7 @@ def test_template_passes_its_contract_tests(tmp_path):
          TEMPLATE / 'test'], cwd=tmp_path, capture_output=True, text=True, timeout=120,
         env={**os.environ, 'PYTHONPATH': str(TEMPLATE), 'PYTHONDONTWRITEBYTECODE': '1'})
     assert result.returncode == 0, result.stdout
-    assert result.stdout.startswith('.' * 18 + ' ')
+    assert result.stdout.startswith('.' * 19 + ' ')
 
 
 def test_launch_files_can_name_the_template_s_machine(monkeypatch):

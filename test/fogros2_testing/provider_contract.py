@@ -61,6 +61,12 @@ class ProviderContract:
         """Return a provider, and the options of machines for the tests."""
         raise LookupError(f'{type(self).__name__} has to say what it tests: write make()')
 
+    def another(self, provider: Provider, spec: MachineSpec) -> Provider:
+        """Return the provider as another process makes it, which has a record of the machine."""
+        made = type(provider)()
+        made.search_for([spec])
+        return made
+
     @contextlib.contextmanager
     def machine(
         self, tags: Mapping[str, str] = MappingProxyType({}), *,
@@ -176,13 +182,15 @@ class ProviderContract:
                 assert [m.id for m in provider.find(tags)] == [machine_id]
             assert machine_id in [m.id for m in provider.find({})]
             assert not list(provider.find({'fogros2-test': mark, TAG_NAME: 'another'}))
-            machine, = provider.find({'fogros2-test': mark})
+            other = self.another(provider, spec)
+            machine, = other.find({'fogros2-test': mark})
+            assert other.describe(machine_id).id == machine_id
             assert machine.name == spec.name
             assert machine.tags['fogros2-test'] == mark
 
     def test_destroyed_machine_is_gone_and_its_name_is_free(self) -> None:
         with self.machine() as (provider, spec, _, machine_id):
-            provider.destroy(machine_id)
+            self.another(provider, spec).destroy(machine_id)
             provider.destroy(machine_id)
             if not provider.capabilities.owned:
                 return

@@ -34,6 +34,7 @@ from fogros2.model import (
     Result,
     to_json,
 )
+from fogros2.provider import Provider
 from fogros2.provider.container import ContainerProvider
 from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import machine as container_machine
@@ -107,6 +108,9 @@ class TestHostedProvider(ProviderContract):
         provider = HostedProvider()
         provider.check(MachineSpec('any', 'hosted', self.options))
         return provider, self.options
+
+    def another(self, provider: Provider, spec: MachineSpec) -> Provider:
+        return self.make()[0]  # no record names the host
 
 
 def spec_on(on: dict[str, Any], **options: Any) -> MachineSpec:

@@ -26,7 +26,16 @@ class TestShelf(ProviderContract):
 
     def make(self):
         """Return a provider, and the options of its machines."""
-        return ShelfProvider(str(self.folder)), {'folder': str(self.folder)}
+        options = {'folder': str(self.folder)}
+        provider = ShelfProvider()
+        provider.search_for([MachineSpec('any', 'shelf', options)])
+        return provider, options
+
+    def test_key_of_the_launch_may_log_in(self):
+        """Look where sshd of the computer gets the key."""
+        with self.machine() as (_, _, request, _):
+            loan, = (json.loads(path.read_text()) for path in self.folder.glob('*.loan'))
+            assert loan['key'] == request.authorized_key
 
     def test_full_shelf_is_an_error(self):
         """Ask for a third computer."""
