@@ -29,6 +29,8 @@ def test_launch_files_can_name_the_template_s_machine(monkeypatch):
     monkeypatch.syspath_prepend(str(TEMPLATE))
     from fogros2_shelf.machines import ShelfInstance
     assert ShelfInstance(folder='/srv/shelf', name='planner').provider == 'shelf'
+    with pytest.raises(ConfigurationError, match='folder=True has the wrong type'):
+        ShelfInstance(folder=True, name='planner')
 
 
 def test_cloud_template_checks_its_options(monkeypatch):

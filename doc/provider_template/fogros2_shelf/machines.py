@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The class that launch files use."""
 
-from typing import Any, Optional
+from __future__ import annotations
+
+from typing import Any, Optional, TYPE_CHECKING
 
 from fogros2 import CloudInstance
+from fogros2.describe.kinds import options_of
+
+if TYPE_CHECKING:
+    from launch import SomeSubstitutionsType
 
 
 class ShelfInstance(CloudInstance):
@@ -17,6 +23,7 @@ class ShelfInstance(CloudInstance):
     provider = 'shelf'
 
     def __init__(
-        self, folder: Optional[str] = None, user: Optional[str] = None, **common: Any,
+        self, folder: Optional[SomeSubstitutionsType] = None,
+        user: Optional[SomeSubstitutionsType] = None, **common: Any,
     ) -> None:
-        super().__init__(options={'folder': folder, 'user': user}, **common)
+        super().__init__(options=options_of(ShelfInstance.__init__, locals()), **common)
