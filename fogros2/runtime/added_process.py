@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import shlex
 from typing import Any, Optional
 
 from launch import Substitution
@@ -15,6 +16,8 @@ from fogros2.errors import ConfigurationError
 from fogros2.launch_internals import private
 from fogros2.model import NodeSpec, Text
 
+#: Fields of a NodeSpec that a process action has not.
+_LOST = ('files', 'folders', 'shell', 'passes_signals', 'features')
 _PACKAGE_PATHS = {'share': FindPackageShare, 'prefix': FindPackagePrefix}
 
 
@@ -29,6 +32,10 @@ class AddedProcess(ExecuteProcess):
     """
 
     def __init__(self, spec: NodeSpec, up: Optional[asyncio.Future[bool]] = None) -> None:
+        if lost := [name for name in _LOST if getattr(spec, name)]:
+            raise ConfigurationError(
+                f"the program '{spec.name}' of a feature has {', '.join(lost)}, which FogROS2 "
+                'does not pass on', 'use arguments, environment, cwd or prefix')
         command: list[list[Substitution]] = [_substitutions(text) for text in spec.arguments]
         if spec.package:
             command.insert(0, [ExecutableInPackage(
@@ -37,6 +44,11 @@ class AddedProcess(ExecuteProcess):
             key: _substitutions(value) for key, value in spec.environment.items()}
         super().__init__(
             cmd=command, name=spec.name, additional_env=environment, respawn=spec.respawn,
+            prefix=[part for text in spec.prefix for part in (
+                *_substitutions(shlex.quote(text) if isinstance(text, str) else text),
+                TextSubstitution(text=' '))] or None,
+            cwd=None if spec.cwd is None else _substitutions(spec.cwd),
+            emulate_tty=spec.emulate_tty, respawn_max_retries=spec.respawn_max_retries,
             respawn_delay=spec.respawn_delay, sigterm_timeout=str(spec.sigterm_timeout),
             sigkill_timeout=str(spec.sigkill_timeout))
         #: The id of its node.

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
+import dataclasses
 import io
 
 from launch import LaunchContext, LaunchDescription
@@ -39,6 +40,9 @@ from fogros2.actions.launch_description import holder
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
 from fogros2.errors import ConfigurationError
+from fogros2.feature import Feature
+from fogros2.model import NodeSpec
+from fogros2.runtime.added_process import AddedProcess
 from fogros2_testing.plugins import instead
 from rigs.launching import ends, Harmless
 from ros2fog_cli.option.machine import MachineOption
@@ -406,3 +410,34 @@ def test_home_of_the_robot_in_a_component_is_mentioned(
     said = capfd.readouterr().out
     assert 'planner: one gets /home/me/b, /home/me/one of this robot' in said
     assert 'two' not in said
+
+
+# -- programs of features ------------------------------------------------------------------------
+
+def test_program_beside_nodes_starts_as_its_feature_says(run, fake, planner, monkeypatch):
+    program = NodeSpec(
+        'x', 'beside', 'demo', 'talker', ('a',), prefix=('nice', '-n', 'two words'), cwd='/srv',
+        environment={'A': 'b'}, emulate_tty=True, respawn=True, respawn_max_retries=2)
+
+    class Beside(Feature):
+        always = True
+
+        def beside(self, spec, own):
+            return [program]
+
+    def on_start(machine, node):
+        for each in machine.all if len(machine.all) == 2 else ():
+            machine.say('exited', each, returncode=0, respawns=False)
+
+    instead(monkeypatch, 'fogros2.feature', {'beside': Beside})
+    fake.on_start = on_start
+    assert run(LaunchDescription([node(machine=planner)])) == 0
+    (started,) = (each for each in fake.machines['planner'].all if each.arguments == ('a',))
+    assert dataclasses.replace(started, id='x', name='beside') == program
+
+
+@pytest.mark.parametrize('field', [{'files': {'f': 'x'}}, {'folders': {'PATH': '/'}},
+                                   {'shell': True}])
+def test_program_with_a_field_that_gets_lost_is_refused(field):
+    with pytest.raises(ConfigurationError, match=f"'beside' of a feature has {[*field][0]}"):
+        AddedProcess(NodeSpec('x', 'beside', 'demo', 'talker', **field))
