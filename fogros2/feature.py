@@ -338,7 +338,11 @@ class LaunchPart:
         return (), ()
 
     def watch(self) -> None:
-        """Watch the launch in a thread, from its first machines on until ``ended`` is set."""
+        """
+        Watch the launch in a thread, from its first machines on until ``ended`` is set.
+
+        The launch waits for its return before it ends, and reports an error.
+        """
 
 
 class Feature:

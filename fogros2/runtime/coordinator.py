@@ -19,6 +19,7 @@ import functools
 import os
 from pathlib import Path
 import threading
+import time
 from typing import Any, Optional, TYPE_CHECKING, Union
 import weakref
 
@@ -35,13 +36,15 @@ from launch.events.process import ProcessStarted, ShutdownProcess
 import launch.logging
 from launch.substitutions import SubstitutionFailure
 
-from fogros2 import feature
+from fogros2 import feature, plugin_system
 from fogros2.describe import defaults, values
 from fogros2.describe.keywords import ROBOT
 from fogros2.describe.machines import CloudInstance, unknown_machine
 from fogros2.errors import Cancelled, ConfigurationError, FogError
+from fogros2.feature import LaunchPart
 from fogros2.launch_internals import private
 from fogros2.model import NodeSpec
+from fogros2.report import StepFailed
 from fogros2.runtime import added_process, cost, signals
 from fogros2.runtime.console import Console
 from fogros2.runtime.interruption import MachineInterrupted
@@ -521,7 +524,17 @@ class Coordinator:
             return
         await asyncio.gather(*(self._up(session) for session in sessions))
         if not self._watches and not self._cancel.is_set():
-            self._watches = [self._in_thread(part.watch) for part in self.parts]
+            self._watches = [self._in_thread(self._watch, part) for part in self.parts]
+
+    def _watch(self, part: LaunchPart) -> None:
+        begin = time.monotonic()
+        try:
+            part.watch()
+        except Exception as error:  # noqa: BLE001 - the launch goes on without the watch
+            if self._console is not None and not isinstance(error, Cancelled):
+                self._console(StepFailed(
+                    '', f'watch of {type(part).__module__}', time.monotonic() - begin,
+                    plugin_system.cause(error), fatal=False))
 
     async def _up(self, session: Session) -> None:
         try:

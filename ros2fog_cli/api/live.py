@@ -14,7 +14,7 @@ import threading
 import time
 from typing import Any, Optional
 
-from fogros2 import feature
+from fogros2 import feature, plugin_system
 from fogros2.errors import FogError, MachineNotFound
 from fogros2.store import launch_process, robot_name, Store
 from ros2fog_cli.api import endings, machines
@@ -273,8 +273,15 @@ class Live:
                                 if step.machine == shown.entry.name)
             shown.clock = launch.contents.clocks.get(shown.entry.name)
         folder = self.store.root / 'launches' / shown.launch
-        shown.figures = {name: rows for name, each in self._tables.items()
-                         if (rows := each.figures(folder, shown.entry.name)) is not None}
+        shown.unread.clear()
+        for name, each in self._tables.items():
+            rows = shown.figures.pop(name, None)
+            try:
+                rows = each.figures(folder, shown.entry.name)
+            except Exception as error:  # noqa: BLE001 - a feature's defect must not end the view
+                shown.unread[name] = plugin_system.cause(error)
+            if rows is not None:
+                shown.figures[name] = rows
         if not is_present:
             shown.ended = shown.ended or now
         if not (self.watched and is_present and record is not None and record.launch_alive):

@@ -33,7 +33,9 @@ class Shown:
     deleting: bool = False
     trouble: str = ''
     #: Rows of features from files of its launch, by the features' names.
-    figures: Mapping[str, Sequence[Mapping[str, Any]]] = dataclasses.field(default_factory=dict)
+    figures: dict[str, Sequence[Mapping[str, Any]]] = dataclasses.field(default_factory=dict)
+    #: Why a feature has no new rows, by its name.
+    unread: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def is_of(self, entry: Entry) -> bool:
         """
@@ -107,8 +109,8 @@ def machine_json(key: str, shown: Shown) -> dict[str, Any]:
             'returncode': node['returncode'], 'restarts': node['restarts'],
             'error': node.get('error', '')} for node in agent['nodes']],
         **shown.figures,
-        'problems': [f'{part}: {text}' for part, text in sorted(follower.problems.items())]
-        if follower is not None else [],
+        'problems': [f'{part}: {text}' for part, text in sorted(
+            {**shown.unread, **(follower.problems if follower is not None else {})}.items())],
         'log': follower.last if follower is not None else 0,
         'deleting': shown.deleting, 'trouble': shown.trouble,
     }

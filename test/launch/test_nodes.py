@@ -7,6 +7,7 @@ from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
 import dataclasses
 import io
+import threading
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import (
@@ -35,12 +36,13 @@ from fogros2 import (
     FogROSLaunchDescription,
     LifecycleNode,
     Node,
+    plugin_system,
 )
 from fogros2.actions.launch_description import holder
 from fogros2.actions.override import OverrideMachines
 from fogros2.describe.overrides import Overrides
-from fogros2.errors import ConfigurationError
-from fogros2.feature import Feature
+from fogros2.errors import ConfigurationError, ShellError
+from fogros2.feature import Feature, LaunchPart
 from fogros2.model import NodeSpec
 from fogros2.runtime.added_process import AddedProcess
 from fogros2_testing.plugins import instead
@@ -434,6 +436,29 @@ def test_program_beside_nodes_starts_as_its_feature_says(run, fake, planner, mon
     assert run(LaunchDescription([node(machine=planner)])) == 0
     (started,) = (each for each in fake.machines['planner'].all if each.arguments == ('a',))
     assert dataclasses.replace(started, id='x', name='beside') == program
+
+
+@pytest.mark.parametrize('error', [ShellError('no rows'), KeyError('oops')])
+def test_watch_of_a_feature_that_fails_is_reported(
+    run, fake, planner, monkeypatch, capfd, error,
+):
+    failed = threading.Event()
+
+    class Part(LaunchPart):
+        def watch(self):
+            failed.set()
+            raise error
+
+    class Watching(Feature):
+        def in_launch(self, launch):
+            return Part()
+
+    instead(monkeypatch, 'fogros2.feature', {'watching': Watching})
+    fake.on_start = lambda machine, node: (
+        failed.wait(60), machine.say('exited', node, returncode=0, respawns=False))
+    assert run(LaunchDescription([node(machine=planner)])) == 0
+    assert f'watch of {__name__} failed' in (said := ''.join(capfd.readouterr()))
+    assert plugin_system.cause(error) in said
 
 
 @pytest.mark.parametrize('field', [{'files': {'f': 'x'}}, {'folders': {'PATH': '/'}},

@@ -8,12 +8,14 @@ import dataclasses
 from decimal import Decimal
 import json
 import os
+from pathlib import Path
 import time
 from typing import Any
 
 import pytest
 
 from fogros2.errors import MachineNotFound, NameTaken, ProviderError
+from fogros2.feature import Feature
 from fogros2.journal import Journal
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, TAG_NAME, TAG_ROBOT
@@ -175,6 +177,34 @@ def test_dead_launch_and_damaged_record_are_shown(live: Live) -> None:
     shown = when(live, 'left', lambda one: 'launch gone' in one['state'])
     assert not shown['launch_alive'] and shown['phase'] == 'running'
     assert 'record damaged' in when(live, 'torn', lambda one: True)['state']
+
+
+def test_defect_of_a_feature_leaves_its_last_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Mine(Feature):
+        headings = ('A',)
+        rows = [OSError('replaced'), [{'a': 1}]]
+
+        def figures(self, folder: Path, machine: str) -> Any:
+            now = self.rows[-1]
+            if isinstance(now, OSError):
+                raise now
+            return now
+
+    instead(monkeypatch, 'fogros2.feature', {'mine': Mine})
+    monkeypatch.setattr('ros2fog_cli.api.live.LOOK', 0.02)
+    machine('a', **alive())
+    live = Live()
+    live.start()
+    try:
+        wait_until(lambda: live.state().get('machines'), timeout=60.0, what='the first look')
+        when(live, 'a', lambda one: one['mine'] == [{'a': 1}] and not one['problems'])
+        rows = Mine.rows.pop()
+        when(live, 'a', lambda one: one['mine'] == [{'a': 1}]
+             and 'mine: OSError: replaced' in one['problems'])
+        Mine.rows.append(rows)
+        when(live, 'a', lambda one: not one['problems'])
+    finally:
+        live.close()
 
 
 def test_nothing_is_polled_while_nobody_watches(monkeypatch: pytest.MonkeyPatch) -> None:
