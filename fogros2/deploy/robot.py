@@ -11,7 +11,7 @@ import threading
 from typing import Optional
 
 from fogros2 import plan, plugin_system, process, ros2_daemon
-from fogros2.errors import PrerequisiteError
+from fogros2.errors import ConfigurationError, PrerequisiteError
 from fogros2.model import Command
 from fogros2.provider import Provider
 from fogros2.store import delete_folder
@@ -35,9 +35,13 @@ def provider(name: str) -> Provider:
     """
     Return the provider with this name.
 
-    :raises ConfigurationError: there is no such provider.
+    :raises ConfigurationError: there is no such provider, or its class has another name.
     """
     instance: Provider = plugin_system.load('fogros2.provider', name)()
+    if instance.name != name:  # its machines would have a provider that nobody finds
+        raise ConfigurationError(
+            f"the provider '{name}' can't be used: its class {type(instance).__name__} has the "
+            f"name '{instance.name}'", 'its author has to give both the same name')
     return instance
 
 

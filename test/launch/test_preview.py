@@ -80,7 +80,8 @@ class Cloud(FakeProvider):
 @pytest.fixture(autouse=True)
 def cloud(monkeypatch: pytest.MonkeyPatch) -> type[Cloud]:
     Cloud.asked = []
-    instead(monkeypatch, 'fogros2.provider', {'aws': Cloud, 'container': FakeProvider})
+    instead(monkeypatch, 'fogros2.provider', {
+        'aws': Cloud, 'container': type('Local', (FakeProvider,), {'name': 'container'})})
     monkeypatch.setattr('fogros2.shell.warm', lambda kind: None)
     return Cloud
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future, wait
 import contextlib
+import copy
 import dataclasses
 import hashlib
 import os
@@ -87,7 +88,13 @@ SPEC = MachineSpec('planner', 'fake')
 @pytest.fixture
 def provider(monkeypatch):
     fake = FakeProvider()
-    instead(monkeypatch, 'fogros2.provider', {'fake': lambda: fake, 'ssh': lambda: fake})
+
+    def ssh():
+        made = copy.copy(fake)
+        made.name = 'ssh'
+        return made
+
+    instead(monkeypatch, 'fogros2.provider', {'fake': lambda: fake, 'ssh': ssh})
     return fake
 
 
@@ -192,6 +199,7 @@ def test_launch_without_a_port_for_a_daemon_of_ros2_begins(launch, monkeypatch):
 class Offers(FakeProvider):
     """A provider that stands for the other one."""
 
+    name = 'offers'
     capabilities = Capabilities(shell_kind='local', places=True)
 
     def places(self, spec):
@@ -209,6 +217,13 @@ def test_machine_that_cannot_be_stopped_is_refused(launch, checked, monkeypatch,
         launch.check_here([spec])
         launch.prepare([spec])
     assert checked.calls == []
+
+
+def test_provider_of_another_name_is_refused(launch, monkeypatch):
+    """Nobody would find its machines."""
+    instead(monkeypatch, 'fogros2.provider', {'my_fake': FakeProvider})
+    with pytest.raises(ConfigurationError, match="FakeProvider has the name 'fake'"):
+        launch.check_here([dataclasses.replace(SPEC, provider='my_fake')])
 
 
 def test_first_problem_ends_the_early_checks(launch, checked, monkeypatch):
