@@ -354,6 +354,9 @@ class Feature:
     each has a default. It raises ConfigurationError for a wrong value, and returns what the other
     methods get as ``own``. ``node_options`` is the same for nodes of machines; its values are in
     ``NodeSpec.features``.
+
+    Each method is called on a new object: nothing in ``self`` reaches a later one. ``check_node``, ``beside``, ``in_launch`` and ``session`` are
+    called on launch's event loop and must not wait, the others in threads of several machines.
     """
 
     options: ClassVar[Callable[..., Any]] = staticmethod(lambda: None)
