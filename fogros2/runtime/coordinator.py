@@ -329,9 +329,13 @@ class Coordinator:
         self._instances[spec.name] = machine
         session = self._sessions.get(spec.name)
         if session is None:
-            make = next((made for each, own in feature.used(spec)
-                         if (made := each.session(own)) is not None), Session)
-            session = make(
+            makes = [made for each, own in feature.used(spec)
+                     if (made := each.session(own)) is not None] or [Session]
+            if len(makes) > 1:
+                raise ConfigurationError(
+                    f"several features want to handle the events of '{spec.name}'",
+                    'pip list shows the installed packages: remove one with such a feature')
+            session = makes[0](
                 spec, self._context.asyncio_loop, in_thread=self._in_thread, fail=self._fail,
                 changed=self._open_gate, preempted=self._preempted,
                 busy=functools.partial(private.waiting_events, self._context),

@@ -45,6 +45,7 @@ from fogros2.errors import ConfigurationError, ShellError
 from fogros2.feature import Feature, LaunchPart
 from fogros2.model import NodeSpec
 from fogros2.runtime.added_process import AddedProcess
+from fogros2.runtime.session import Session
 from fogros2_testing.plugins import instead
 from rigs.launching import ends, Harmless
 from ros2fog_cli.option.machine import MachineOption
@@ -436,6 +437,19 @@ def test_program_beside_nodes_starts_as_its_feature_says(run, fake, planner, mon
     assert run(LaunchDescription([node(machine=planner)])) == 0
     (started,) = (each for each in fake.machines['planner'].all if each.arguments == ('a',))
     assert dataclasses.replace(started, id='x', name='beside') == program
+
+
+def test_two_features_with_a_session_are_refused(run, fake, planner, monkeypatch, capfd):
+    class Mine(Feature):
+        always = True
+
+        def session(self, own):
+            return Session
+
+    instead(monkeypatch, 'fogros2.feature', {'mine': Mine, 'more': Mine})
+    assert run(LaunchDescription([node(machine=planner)])) == 1
+    assert "several features want to handle the events of 'planner'" in ''.join(capfd.readouterr())
+    assert not fake.noted('up')
 
 
 @pytest.mark.parametrize('error', [ShellError('no rows'), KeyError('oops')])
