@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from typing import Any
 
 from ros2fog_cli.verb import add_json, add_region, print_json, VerbExtension, warn
 
@@ -23,11 +24,16 @@ class ListVerb(VerbExtension):
 
         from fogros2 import plugin_system
         from ros2fog_cli.api import machines, table
+
+        def more(name: str) -> tuple[list[dict[str, Any]], str]:
+            rows, line = plugin_system.load('fogros2.listed', name)(args.region)
+            return rows, line
+
         with ThreadPoolExecutor(1, 'fog-list') as pool:
-            asked = {name: pool.submit(plugin_system.load('fogros2.listed', name), args.region)
-                     for name in plugin_system.names('fogros2.listed')}
+            names = plugin_system.names('fogros2.listed')
+            asked = pool.submit(machines.ask_all, warn, names, more)
             entries = machines.survey(warn, regions=args.region)
-            others = {name: one.result() for name, one in asked.items()}
+            others = {name: one or ([], '') for name, one in zip(names, asked.result())}
         now = time.time()
         if args.json:
             print_json(machines=[entry.to_json(now) for entry in entries],

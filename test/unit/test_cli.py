@@ -145,6 +145,20 @@ def test_list_without_machines(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.err == "nosdk: the provider 'nosdk' can't be loaded (pip install nosdk)\n"
 
 
+def test_list_goes_on_without_what_a_feature_cannot_list(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    def listed(regions: object) -> object:
+        raise ProviderError('the service does not answer')
+
+    instead(monkeypatch, 'fogros2.listed', {'mine': listed})
+    machine('a')
+    assert run('list', '--json') == 0
+    out = capsys.readouterr()
+    assert [one['name'] for one in json.loads(out.out)['machines']] == ['a']
+    assert 'mine: the service does not answer' in out.err
+
+
 def test_list_shows_what_providers_and_the_store_know(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
