@@ -28,7 +28,8 @@ def _all() -> Any:
 
 @functools.cache
 def _entry_points(group: str) -> dict[str, EntryPoint]:
-    return {point.name: point for point in _all().select(group=group)}
+    # of several packages with one name, the first on sys.path has it, as for modules
+    return {point.name: point for point in reversed(list(_all().select(group=group)))}
 
 
 @functools.cache
@@ -59,12 +60,13 @@ def load(group: str, name: str) -> Any:
         return points[name].load()
     except ImportError as error:
         module = error.name or name
-        remedy = f'python3 -m pip install {module}'
+        dist = str(getattr(points[name].dist, 'name', 'fogros2'))
+        own = dist == 'fogros2'
+        # a module of an unknown package may have another name than its project
+        remedy = f'python3 -m pip install {module if own else f"--upgrade {dist}"}'
         if module.partition('.')[0] in own_packages():
-            dist = points[name].dist
-            remedy = 'install FogROS2 again from the folder that it came from' \
-                if dist is None or dist.name == 'fogros2' else \
-                f'install a version of {dist.name} that is for this version of FogROS2'
+            remedy = 'install FogROS2 again from the folder that it came from' if own else \
+                f'install a version of {dist} that is for this version of FogROS2'
         raise PrerequisiteError(
             f"the {_kind(group)} '{name}' can't be loaded: {error}", remedy) from error
     except Exception as error:  # one defective plugin must not end the others

@@ -68,6 +68,7 @@ def test_unknown_plugin_is_refused_with_a_suggestion():
 
 @pytest.mark.parametrize(('program', 'message', 'hint'), [
     ('import fogros2.transport', 'fogros2.transport', 'install a version of fogt_shelf'),
+    ('import fogt_missing', 'No module named .fogt_missing', 'pip install --upgrade fogt_shelf'),
     ('1 / 0', 'of fogt_shelf 0 .* ZeroDivisionError: division by zero', 'import fogt_shelf'),
     ('def', 'SyntaxError: .*fogt_shelf.py, line 1', 'import fogt_shelf')])
 def test_defective_plugin_is_named(tmp_path, monkeypatch, program, message, hint):
@@ -79,6 +80,13 @@ def test_defective_plugin_is_named(tmp_path, monkeypatch, program, message, hint
     with pytest.raises(errors.PrerequisiteError, match=message) as caught:
         plugin_system.load('fogros2.feature', 'shelf')
     assert hint in caught.value.hint and 'install FogROS2' not in caught.value.hint
+
+
+def test_first_of_two_plugins_with_one_name_wins(monkeypatch):
+    points = [metadata.EntryPoint('budget', f'{name}:A', 'fogros2.feature')
+              for name in ('first', 'second')]
+    monkeypatch.setattr(plugin_system, '_all', lambda: metadata.EntryPoints(points))
+    assert plugin_system._entry_points.__wrapped__('fogros2.feature')['budget'] == points[0]
 
 
 def test_json_of_the_model_is_plain():
