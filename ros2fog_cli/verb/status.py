@@ -33,7 +33,7 @@ class StatusVerb(VerbExtension):
 
     def main(self, *, args: argparse.Namespace) -> int:
         """Print the status; return 1 if there are problems or no expected agent answers."""
-        from fogros2 import feature
+        from fogros2 import feature, plugin_system
         from fogros2.errors import ConfigurationError, FogError
         from fogros2.store import other_vpn, Store
         from ros2fog_cli.api import reach
@@ -88,8 +88,10 @@ class StatusVerb(VerbExtension):
         else:
             problems.append(f"agent: this robot has no record of '{entry.name}'; only the robot "
                             'that launched it can ask its agent')
-        if any('_encoder' in node['name'] or '_decoder' in node['name']
-               for node in (status['agent'] or {}).get('nodes', ())):
+        parts = [f'_{transport}_{part}' for part in ('encoder', 'decoder')
+                 for transport in plugin_system.names('fogros2.image_transport')]
+        if any(part in node['name'] for node in (status['agent'] or {}).get('nodes', ())
+               for part in parts):
             from ros2fog_cli.api import progress
             from ros2fog_cli.api.watching import streams
             with progress.working('measuring streams'):

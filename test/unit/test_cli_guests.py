@@ -201,11 +201,17 @@ def test_status_shows_guests_while_the_feature_is_installed(
     assert asked == [('look', None)] * 2
 
 
+@pytest.mark.parametrize(('node', 'measured'), [
+    ('image_h264_decoder_on_planner', True), ('cloud_pointcloud_encoder-2', True),
+    ('wheel_encoder-1', False), ('video_decoder-2', False)])
 def test_status_shows_that_it_measures_streams(
     asked: list[tuple[str, Any]], capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, node: str, measured: bool,
 ) -> None:
+    measurements = []
+
     def streams(name: str, **more: object) -> list[object]:
+        measurements.append(name)
         deadline = time.monotonic() + 60.0
         while 'measuring streams' not in capsys.readouterr().err:
             assert time.monotonic() < deadline
@@ -215,9 +221,10 @@ def test_status_shows_that_it_measures_streams(
     monkeypatch.setattr(progress, 'STILL', 0.01)
     monkeypatch.setattr('ros2fog_cli.api.watching.streams', streams)
     monkeypatch.setattr(reach, 'agent', lambda *_: SimpleNamespace(
-        status=lambda timeout: {'nodes': [{'name': 'image_decoder'}]}, close=lambda: None))
+        status=lambda timeout: {'nodes': [{'name': node}]}, close=lambda: None))
     monkeypatch.setattr(reach, 'link', lambda record: None)
     assert fog('status', 'planner', '--json') == 0
+    assert measurements == ['planner'] * measured
 
 
 @pytest.mark.parametrize('change', [
