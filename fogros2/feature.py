@@ -150,7 +150,11 @@ class RunningMachine(ReachedMachine, Protocol):
         """
 
     def give_up(self, reason: str) -> None:
-        """Let the launch end machine and nodes as ``on_exit`` says, and go on without them."""
+        """
+        Let the launch end machine and nodes as ``on_exit`` says, and go on without them.
+
+        Only once its nodes start: raise a FogError before that.
+        """
 
     def lose_after(self, seconds: float) -> None:
         """Count a silent machine as lost after this time, even if its provider says it runs."""
@@ -355,8 +359,9 @@ class Feature:
     methods get as ``own``. ``node_options`` is the same for nodes of machines; its values are in
     ``NodeSpec.features``.
 
-    Each method is called on a new object: nothing in ``self`` reaches a later one. ``check_node``, ``beside``, ``in_launch`` and ``session`` are
-    called on launch's event loop and must not wait, the others in threads of several machines.
+    Each method is called on a new object: nothing in ``self`` reaches a later one. ``check_node``,
+    ``beside``, ``in_launch`` and ``session`` are called on launch's event loop and must not wait,
+    the others in threads of several machines.
     """
 
     options: ClassVar[Callable[..., Any]] = staticmethod(lambda: None)
@@ -419,7 +424,10 @@ class Feature:
 
     def check_node(self, spec: MachineSpec, node: NodeSpec, own: Any) -> None:
         """
-        Check a node of a machine that uses the feature before the machine is created.
+        Check a node of a machine that uses the feature, if possible before the machine is created.
+
+        Programs that FogROS2 adds are nodes too, such as encoders. A node that a timer or an event
+        starts is checked when the machine runs.
 
         :raises FogError: the feature can't work with it.
         """
@@ -481,7 +489,8 @@ class Feature:
         """
         Return what makes the machine's :class:`~fogros2.runtime.session.Session`, None for that.
 
-        A subclass of Session may move the nodes when the machine ends.
+        A subclass of Session may move the nodes when the machine ends. Only one installed feature
+        may return one, and ``replacement`` of FogROS2 does.
         """
         return None
 

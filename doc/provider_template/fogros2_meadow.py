@@ -127,7 +127,7 @@ class MeadowProvider(VmProvider):
 
     name = 'meadow'
     adapter = Meadow
-    #: Lacks stop, images, preemption_notice and application_port.
+    #: Lacks stop, preemption_notice and application_port.
     capabilities = VmProvider.capabilities  # dataclasses.replace(..., stop=True) adds one
 
     def check(self, spec: MachineSpec) -> None:

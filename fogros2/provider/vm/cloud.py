@@ -219,7 +219,8 @@ class VmCloud(abc.ABC):
     title: ClassVar[str]
     options: ClassVar[type[VmOptions]]
     regions: ClassVar[Regions]
-    #: Regular expression of the cloud's ids of machines.
+    #: Regular expression, without groups, of the cloud's ids of machines; its regions are
+    #: ``[a-z0-9-]+``.
     id_form: ClassVar[str]
     #: Region for requests that belong to no region.
     base_region: ClassVar[str]

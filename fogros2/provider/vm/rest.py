@@ -55,7 +55,7 @@ class RestAccount(Account, abc.ABC):
 
     @abc.abstractmethod
     def refusal(self, status: int, body: Any, what: str) -> FogError:
-        """Return the error for an answer with an error; ``body`` is None if it is not JSON."""
+        """Return the error for an answer with an error; ``body`` is its JSON, a text or None."""
 
     def ask(
         self, method: str, url: str, what: str, body: Any = None, *, repeatable: bool = True,
