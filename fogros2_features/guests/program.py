@@ -72,9 +72,14 @@ exec >/dev/null 2>&1 </dev/null
     find /var/spool -xdev -uid "$1" -delete
 }} &
 """
-#: Ends all other processes of the account that runs it.
+#: Ends all processes of the user $1 with the group $2. The third argument is its own real and
+#: saved id, so that none of them can stop or kill it first.
 KILL = """\
-import os
+import os, sys
+uid, gid, spare = map(int, sys.argv[1:])
+os.setgroups([])
+os.setresgid(gid, gid, gid)
+os.setresuid(spare, uid, spare)
 os.kill(-1, 9)
 """
 
@@ -293,15 +298,21 @@ def runs(uid: int) -> bool:
 
 
 def evict(user: str) -> None:
-    """End a guest's processes, and delete its account and its files; idempotent."""
+    """
+    End a guest's processes, and delete its account and its files; idempotent.
+
+    :raises OSError: a process does not end.
+    """
     try:
         entry = pwd.getpwnam(user)
     except KeyError:
         return
     until = time.monotonic() + 5.0
-    while runs(entry.pw_uid) and time.monotonic() < until:
-        subprocess.run((sys.executable, '-ISc', KILL), user=entry.pw_uid, group=entry.pw_gid,
-                       extra_groups=(), stderr=subprocess.DEVNULL)
+    while runs(entry.pw_uid):
+        if time.monotonic() > until:
+            raise OSError(f"a process of '{user}' does not end")
+        subprocess.run((sys.executable, '-ISc', KILL, *map(str, (
+            entry.pw_uid, entry.pw_gid, new_id()))), stderr=subprocess.DEVNULL)
         time.sleep(0.02)
     with contextlib.suppress(FileNotFoundError):
         # memory of System V outlives its processes; of other accounts' it removes nothing
@@ -457,10 +468,11 @@ class Door(socketserver.ThreadingTCPServer):
             os.chown(home, entry.pw_uid, entry.pw_gid)
         confine(user, entry.pw_uid)
         link.settimeout(None)
+        # Popen with user= would wait for a process that the guest's other processes can stop
         return subprocess.Popen(
-            ('sh', '-c', ENTRY, self.request['shell']), stdin=link.fileno(), stdout=link.fileno(),
-            stderr=subprocess.DEVNULL, cwd=home, user=entry.pw_uid, group=entry.pw_gid,
-            extra_groups=(), umask=0o022, start_new_session=True, env={
+            ('setpriv', f'--reuid={entry.pw_uid}', f'--regid={entry.pw_gid}', '--clear-groups',
+             'sh', '-c', ENTRY, self.request['shell']), stdin=link.fileno(), stdout=link.fileno(),
+            stderr=subprocess.DEVNULL, cwd=home, umask=0o022, start_new_session=True, env={
                 'HOME': str(home), 'USER': user, 'LOGNAME': user, 'SHELL': '/bin/sh',
                 'LANG': 'C.UTF-8', 'PATH': '/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin'})
 

@@ -8,8 +8,11 @@ import inspect
 import json
 import os
 from pathlib import Path
+import signal
+import socket
 import subprocess
 import sys
+import threading
 from types import SimpleNamespace
 from typing import Any
 
@@ -230,6 +233,53 @@ def test_eviction_waits_for_no_process_of_others(
     finally:
         child.kill()
         child.communicate()
+
+
+#: Prints a line; sends a signal to all other processes of its account, again and again.
+HOSTILE = """
+import os, sys
+print(flush=True)
+while True:
+    try:
+        os.kill(-1, int(sys.argv[1]))
+    except OSError:
+        pass
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='root alone starts processes of another account')
+@pytest.mark.parametrize('sent', [signal.SIGSTOP, signal.SIGKILL])
+def test_guest_holds_neither_its_door_nor_its_end(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sent: signal.Signals,
+) -> None:
+    def run() -> None:
+        shells = [guests.Door.begin(door, link, 'guest') for _ in range(50)]
+        guests.evict('guest')
+        for shell in shells:
+            shell.wait()
+
+    number = guests.new_id()
+    monkeypatch.setattr(guests.pwd, 'getpwnam', lambda user: SimpleNamespace(
+        pw_uid=number, pw_gid=number))
+    for name, value in (('HOMES', tmp_path), ('CLEAN', ':'), ('ENTRY', ':'),
+                        ('confine', lambda *_: None)):
+        monkeypatch.setattr(guests, name, value)
+    (tmp_path / 'guest').mkdir()
+    door: Any = SimpleNamespace(request={'shell': ''})
+    ours, link = socket.socketpair()
+    hostile = subprocess.Popen([sys.executable, '-ISc', HOSTILE, str(int(sent))], user=number,
+                               group=number, extra_groups=(), stdout=subprocess.PIPE)
+    try:
+        assert hostile.stdout is not None and hostile.stdout.readline()
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        thread.join(60.0)
+        assert not thread.is_alive() and not guests.runs(number)
+    finally:
+        ours.close()
+        link.close()
+        hostile.kill()
+        hostile.communicate()
 
 
 @pytest.mark.skipif(os.geteuid() != 0 or os.uname().machine != 'x86_64',
