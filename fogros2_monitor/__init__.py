@@ -25,9 +25,7 @@ of ``ros2 fog``, :mod:`~fogros2_monitor.access` reads a machine's token for them
 entry-point group ``fogros2.monitor``.
 """
 
-import sys
+from fogros2.python_module import RUN_MODULE
 
 #: Command that prints the topics of a launch, see :mod:`~fogros2_monitor.dashboard.graph`.
-#: Without the current folder: it may have modules of other accounts.
-GRAPH = (sys.executable, '-c', 'import sys; sys.path[:] = filter(None, sys.path); '
-         'from fogros2_monitor.dashboard import graph; graph.main()')
+GRAPH = (*RUN_MODULE, 'fogros2_monitor.dashboard.graph')

@@ -27,6 +27,7 @@ import subprocess
 import sys
 
 from fogros2.errors import FogError
+from fogros2.python_module import RUN_MODULE
 from fogros2_monitor import credentials
 from fogros2_monitor.addresses import application_port
 from fogros2_monitor.application import say
@@ -94,17 +95,17 @@ def main() -> None:
         gate += ['--application', f'{_LOOPBACK}:{inside}', '--ready', str(alive)]
         application = ['--image', ours.image, '--port', str(inside), '--name', ours.name]
     subprocess.Popen(
-        [sys.executable, '-m', 'fogros2_monitor.gate', '--to', f'{address}:{port}',
+        [*RUN_MODULE, 'fogros2_monitor.gate', '--to', f'{address}:{port}',
          '--until-eof', *gate], stdin=end, pass_fds=[alive])
     os.close(alive)
     # where the gate of another launch has the port, that launch's application stays
     if application and os.read(ended, 1):
-        subprocess.Popen([sys.executable, '-m', 'fogros2_monitor.application', *application],
+        subprocess.Popen([*RUN_MODULE, 'fogros2_monitor.application', *application],
                          stdin=end)
     os.close(end)
     os.set_inheritable(ended, True)
     os.execv(sys.executable, [
-        sys.executable, '-m', 'fogros2_monitor.bridge', '--ros-args', *words[at + 1:],
+        *RUN_MODULE, 'fogros2_monitor.bridge', '--ros-args', *words[at + 1:],
         '-p', f'address:={address}', '-p', f'port:={port}', '-p', f'gate:={ended}',
         '-p', f'topics:={json.dumps(ours.topic or ["*"])}'])
 

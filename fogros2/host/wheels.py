@@ -31,6 +31,7 @@ from fogros2 import process, store
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError
 from fogros2.host import locked
 from fogros2.model import Command
+from fogros2.python_module import RUN_MODULE
 
 OWN, EMBEDDED, PIP = 'fogros2', 'ros2-embedded', 'pip'
 #: Distributions that only the robot uses.
@@ -158,7 +159,7 @@ def fetch(
         file.flush()
         try:
             process.run(Command((
-                sys.executable, '-c', _RUN_PIP, 'download', '--quiet',
+                *RUN_MODULE, 'pip', 'download', '--quiet',
                 '--disable-pip-version-check', *locked.OPTIONS,
                 *(('--no-index', '--find-links', source) if source else ()),
                 '--find-links', str(target), '--dest', str(target),
@@ -176,9 +177,6 @@ def fetch(
     return target
 
 
-#: Without the current folder: it may have modules of other accounts.
-_RUN_PIP = ('import sys; sys.path[:] = filter(None, sys.path); import runpy; '
-            "runpy.run_module('pip', run_name='__main__', alter_sys=True)")
 #: Platforms of wheels that a machine can use, see ``bootstrap.WHEELS_LIBC``.
 _PLATFORMS = ('manylinux_2_28_x86_64', 'manylinux_2_27_x86_64', 'manylinux_2_24_x86_64',
               'manylinux_2_17_x86_64', 'manylinux2014_x86_64', 'manylinux_2_12_x86_64',

@@ -8,9 +8,9 @@ import contextlib
 import json
 import os
 import subprocess
-import sys
 from typing import Any, Optional
 
+from fogros2.python_module import RUN_MODULE
 from fogros2_examples.meshes import Floats
 from fogros2_examples.planning import worker
 from fogros2_examples.planning.scene import Scene
@@ -37,7 +37,7 @@ class Racer:
 
     @staticmethod
     def _start() -> subprocess.Popen[str]:
-        return subprocess.Popen([sys.executable, '-m', worker.__name__], stdin=subprocess.PIPE,
+        return subprocess.Popen([*RUN_MODULE, worker.__name__], stdin=subprocess.PIPE,
                                 stdout=subprocess.PIPE, text=True)
 
     def enter(self, scene: Scene) -> None:

@@ -28,7 +28,7 @@ PACKAGES = ('fogros2_features', 'fogros2_replicas', 'fogros2_share', 'image_tran
 #: Inside a package the order is the one in which the docstring of its ``__init__`` names the
 #: modules (``name``), lowest first. All imports count, also late ones and those for types.
 ORDER = """
-    model untrusted errors events clock
+    model untrusted errors events clock python_module
     ros_names
     waiting report process
     agent ros_types
@@ -294,6 +294,7 @@ FORBIDDEN = {
     r'shell=True': 'no shell reads our words',
     r'\bos\.(system|popen)\(': 'no shell reads our words',
     r'\byaml\.(load|unsafe_load|full_load)\(': 'yaml.safe_load',
+    r"sys\.executable, '-m', '?(fogros2|worker|pip)": 'RUN_MODULE looks in no current folder',
     r'0\.0\.0\.0/0': 'nothing is open to the world',
 }
 

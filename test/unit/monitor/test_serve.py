@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 import socket
 import subprocess
 import sys
@@ -15,6 +16,17 @@ from rigs.domains import taken
 
 serve = pytest.importorskip(
     'fogros2_monitor.serve', reason='rclpy is not installed')
+BRIDGE = [sys.executable, str(Path(serve.__file__).with_name('scripts') / 'bridge')]
+
+
+@pytest.fixture(autouse=True)
+def imported(tmp_path, monkeypatch):
+    """Start all in a folder with modules of another account, which nothing imports."""
+    for name in ('argparse', 'asyncio', 'foxglove'):
+        (tmp_path / f'{name}.py').write_text(f'open({str(tmp_path / "imported")!r}, "w").close()')
+    monkeypatch.chdir(tmp_path)
+    yield
+    assert not (tmp_path / 'imported').exists()
 
 
 def test_unwritable_token_folder_is_named(tmp_path, monkeypatch):
@@ -32,8 +44,8 @@ def test_application_starts_only_once_the_gate_listens(tmp_path):
     podman.chmod(0o755)
     with socket.create_server(('127.0.0.1', 0)) as other, taken() as domain:
         port = other.getsockname()[1]
-        words = [sys.executable, '-m', 'fogros2_monitor.serve', '--image', 'x', '--secrets',
-                 str(tmp_path), '--listen', f'127.0.0.1:{port}', '--vpn', str(port)]
+        words = [*BRIDGE, '--image', 'x', '--secrets', str(tmp_path),
+                 '--listen', f'127.0.0.1:{port}', '--vpn', str(port)]
         options = {'stderr': subprocess.DEVNULL, 'stdout': subprocess.DEVNULL, 'env': {
             **os.environ, 'ROS_DOMAIN_ID': domain, 'FOGROS2_VPN_ADDRESS': '127.0.0.2',
             'PATH': f'{tmp_path}:{os.environ["PATH"]}'}}
@@ -53,10 +65,10 @@ def test_taken_port_is_named_and_ends_the_bridge(tmp_path):
     with socket.create_server(('127.0.0.1', 0)) as other, taken() as domain:
         port = other.getsockname()[1]
         done = subprocess.run(
-            [sys.executable, '-m', 'fogros2_monitor.serve', '--listen', f'127.0.0.1:{port}',
-             '--secrets', str(tmp_path)], capture_output=True, text=True, timeout=60,
-            env={**os.environ, 'ROS_DOMAIN_ID': domain,
-                 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'})
+            [*BRIDGE, '--listen', f'127.0.0.1:{port}', '--secrets', str(tmp_path)],
+            capture_output=True, text=True, timeout=60, env={
+                **os.environ, 'ROS_DOMAIN_ID': domain,
+                'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'})
     assert done.returncode == 1
     assert f'nobody can listen at 127.0.0.1:{port}: Address already in use\n' in done.stderr
     assert 'the gate has ended' in done.stderr and 'Traceback' not in done.stderr
