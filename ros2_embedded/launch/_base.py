@@ -29,7 +29,7 @@ class Event:
 class Substitution:
     """A text that is only known when the launch runs."""
 
-    _runs_command = False
+    _runs_code = False
 
     def describe(self) -> str:
         return repr(self)

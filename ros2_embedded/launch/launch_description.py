@@ -78,10 +78,10 @@ class LaunchDescription(LaunchDescriptionEntity):
 
 
 class _NoLaunch(LaunchContext):
-    """A context for descriptions, in which no substitution runs a command."""
+    """A context for descriptions, in which no substitution runs a command or an expression."""
 
     def perform_substitution(self, substitution: Any) -> str:
-        if substitution._runs_command:
+        if substitution._runs_code:
             raise RuntimeError(f'{substitution.describe()} runs at launch')
         return super().perform_substitution(substitution)
 

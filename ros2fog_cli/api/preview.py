@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
@@ -22,7 +23,8 @@ from launch.actions import (
     SetLaunchConfiguration,
     UnsetLaunchConfiguration,
 )
-from launch.substitutions import Command, SubstitutionFailure
+from launch.substitutions import Command, PythonExpression, SubstitutionFailure
+from launch.utilities import perform_substitutions
 
 from fogros2.actions.cloud_group import CloudGroup
 from fogros2.actions.fog_machine import FogMachine
@@ -45,6 +47,10 @@ _UNKNOWN = Exception
 #: Executed here as in a launch; scoped groups contain the first three.
 _SETTERS = (PushLaunchConfigurations, PopLaunchConfigurations, ResetLaunchConfigurations,
             SetLaunchConfiguration, UnsetLaunchConfiguration)
+#: Parts of a Python expression that call nothing.
+_HARMLESS = (ast.Expression, ast.Constant, ast.Name, ast.expr_context, ast.List, ast.Tuple,
+             ast.Compare, ast.cmpop, ast.BoolOp, ast.boolop, ast.BinOp, ast.operator,
+             ast.UnaryOp, ast.unaryop, ast.IfExp)
 #: Characters of a value; a longer one is cut.
 _LONGEST = 60
 
@@ -87,11 +93,18 @@ class Planned:
 
 
 class _Context(LaunchContext):
-    """A context in which no substitution runs a command."""
+    """A context in which no substitution runs a command, and no expression calls anything."""
 
     def perform_substitution(self, substitution: Substitution) -> str:
         """Return the value of a substitution."""
-        if isinstance(substitution, Command):
+        refused = isinstance(substitution, Command)
+        if isinstance(substitution, PythonExpression):
+            text = perform_substitutions(self, substitution.expression).strip()
+            refused = not all(isinstance(node, _HARMLESS)
+                              for node in ast.walk(ast.parse(text, mode='eval')))
+            if not refused:  # the text that was checked, and no module but math
+                substitution = PythonExpression(text)
+        if refused:
             raise SubstitutionFailure(f'{substitution.describe()} runs at launch')
         return str(super().perform_substitution(substitution))
 

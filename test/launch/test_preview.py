@@ -22,7 +22,7 @@ from launch.actions import (
 )
 from launch.conditions import IfCondition
 from launch.launch_description_sources import AnyLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PythonExpression
 from launch_ros.actions import Node
 import pytest
 from ros2cli.cli import main
@@ -116,7 +116,8 @@ def test_values_are_those_of_the_arguments():
             DeclareLaunchArgument('region', default_value='eu-west-1'),
             DeclareLaunchArgument('big', default_value='false'),
             node(AWSCloudInstance(name='a', region=LaunchConfiguration('region'))),
-            node(ContainerInstance(name='b'), condition=IfCondition(LaunchConfiguration('big')))]
+            node(ContainerInstance(name='b'), condition=IfCondition(PythonExpression([
+                ' 2 > 1 and "', LaunchConfiguration('big'), '" in ("true", "1")'])))]
 
     assert lines(described()) == ['a: aws (region=eu-west-1)', '    demo talker']
     assert lines(described(), region='us-east-1', big='true') == [

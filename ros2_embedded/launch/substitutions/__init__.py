@@ -189,7 +189,7 @@ class Command(ParsedSubstitution):
     """
 
     _parameters = ('command', 'on_stderr?')
-    _runs_command = True
+    _runs_code = True
 
     def __init__(
         self, command: SomeSubstitutionsType, *, on_stderr: SomeSubstitutionsType = 'fail'
@@ -260,6 +260,7 @@ class FindExecutable(ParsedSubstitution):
 class PythonExpression(ParsedSubstitution):
     """The value of a Python expression over modules; over ``math``, its content too."""
 
+    _runs_code = True
     _parameters = ('expression', 'python_modules?')
 
     def __init__(
