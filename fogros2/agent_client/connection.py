@@ -40,20 +40,26 @@ REFUSAL = 300.0
 #: Bytes of a long request that are written at once.
 PIECE = 1 << 14
 
-#: A request without a waiting caller; its reply shows that the agent is there.
-_PING = b'{"id":0,"command":"ping"}\n'
-
 EventCallback = Callable[[events.Event], None]
 
 
 class _Pending:
-    """A request that waits for its reply."""
+    """
+    A request, which may wait for its reply.
 
-    def __init__(self, command: str, line: bytes) -> None:
+    :ivar slow: seconds for which the link may still take its pieces, on all connections together.
+    """
+
+    def __init__(self, number: int, command: str, **arguments: Any) -> None:
         self.command = command
-        self.line = line
+        self.line = to_json({'id': number, 'command': command, **arguments}).encode() + b'\n'
+        self.slow = len(self.line) // PIECE * SILENCE / 4
         self.done = threading.Event()
         self.reply: dict[str, Any] = {}
+
+
+#: A request without a waiting caller; its reply shows that the agent is there.
+_PING = _Pending(0, 'ping')
 
 
 class AgentClient:
@@ -80,8 +86,8 @@ class AgentClient:
         self._callback: Optional[EventCallback] = None
         self._closed = threading.Event()
         self._lock = threading.Lock()
-        #: Lines to write, each with its connection; None ends the writing thread.
-        self._lines: queue.SimpleQueue[Optional[tuple[Stream, bytes]]] = queue.SimpleQueue()
+        #: Requests to write, each with its connection; None ends the writing thread.
+        self._lines: queue.SimpleQueue[Optional[tuple[Stream, _Pending]]] = queue.SimpleQueue()
         self._heard = 0.0
         #: Seconds in which the link took pieces of long requests.
         self._sending = 0.0
@@ -150,15 +156,14 @@ class AgentClient:
             raise RuntimeError('a subscriber must not make requests')
         self.connect()
         number = next(self._numbers)
-        line = to_json({'id': number, 'command': command, **arguments}).encode() + b'\n'
-        pending = _Pending(command, line)
+        pending = _Pending(number, command, **arguments)
         with self._lock:
             if self._error is not None:
                 raise self._error
             self._pending[number] = pending
             stream = self._stream
         if stream is not None:
-            self._lines.put((stream, line))
+            self._lines.put((stream, pending))
         begin = self._clock()
         deadline = begin + timeout
         try:
@@ -336,23 +341,24 @@ class AgentClient:
 
     def _follow_on(self, stream: Stream) -> None:
         self._log_request = next(self._numbers)
-        self._lines.put((stream, to_json({
-            'id': self._log_request, 'command': 'log', 'from': self._next,
-        }).encode() + b'\n'))
+        self._lines.put((stream, _Pending(self._log_request, 'log', **{'from': self._next})))
 
     def _write_all(self) -> None:
         while (item := self._lines.get()) is not None:
-            stream, line = item
+            stream, request = item
             # after an error of the connection, the reading thread repeats the requests
             with contextlib.suppress(FogError):
-                for position in range(0, len(line), PIECE):
+                for position in range(0, len(request.line), PIECE):
                     begin = time.monotonic()
-                    stream.write(line[position:position + PIECE])
+                    stream.write(request.line[position:position + PIECE])
                     now = time.monotonic()
                     # a single piece may wait in the buffers of a dead connection
                     if position > 0 and now - begin < SILENCE / 4:
                         self._heard = now
-                        self._sending += now - begin
+                        # a machine that ends the connection may get the pieces again and again
+                        taken = min(now - begin, request.slow)
+                        request.slow -= taken
+                        self._sending += taken
 
     def _clock(self) -> float:
         """Return a monotonic time in seconds that stands still while the link takes pieces."""
@@ -403,14 +409,14 @@ class AgentClient:
             again = []
             for pending in self._pending.values():
                 if pending.command != 'signal':  # which would take effect twice
-                    again.append(pending.line)
+                    again.append(pending)
                 elif not pending.done.is_set():
                     pending.reply = {'ok': False, 'error': 'the connection was lost meanwhile'}
                     pending.done.set()
         if self._next is not None:
             self._follow_on(stream)
-        for line in (_PING, *again):
-            self._lines.put((stream, line))
+        for pending in (_PING, *again):
+            self._lines.put((stream, pending))
 
 
 def _parsed(line: bytes) -> dict[str, Any]:

@@ -347,15 +347,23 @@ def test_long_request_passes_a_slow_link_also_again(make):
 
 
 class FullStream(ScriptedStream):
-    """An agent of a hijacked machine that talks, but takes nothing, or long requests slowly."""
+    """
+    An agent of a hijacked machine that talks, but takes nothing, or long requests slowly.
 
-    def __init__(self, pause: float) -> None:
+    :param pieces: after so many pieces of a request, it ends the connection.
+    """
+
+    def __init__(self, pause: float | None, pieces: float = inf) -> None:
         super().__init__(lambda request: [])
-        self.pause = pause
+        self.pause, self.pieces = pause, pieces
         self.closed = threading.Event()
 
     def write(self, data: bytes) -> None:
-        if self.closed.wait(self.pause):
+        if len(data) < connection.PIECE:
+            return
+        self.pieces -= 1
+        if self.pieces < 0 or self.closed.wait(self.pause):
+            self.close()
             raise ConnectError('closed')
 
     def readline(self) -> bytes:
@@ -389,6 +397,17 @@ def test_short_request_waits_for_a_long_one_on_a_slow_link(make):
         client.request('stop', timeout=0.3)
     assert time.monotonic() - begin > 0.6
     stream.close()
+    client.close()
+    with pytest.raises((AgentError, DeadlineExceeded)):
+        long.result(2.0)
+
+
+def test_request_that_is_taken_again_and_again_holds_no_other(make):
+    client = make(*(FullStream(0.2, 9) for _ in range(100)), silence=1.0)
+    long = in_thread(lambda: client.request('start', nodes='x' * 10 * connection.PIECE))
+    until(lambda: client._sending)
+    with pytest.raises(DeadlineExceeded, match="didn't answer 'release'"):
+        in_thread(lambda: client.request('release', timeout=1.5, silent=5.0)).result(8.0)
     client.close()
     with pytest.raises((AgentError, DeadlineExceeded)):
         long.result(2.0)
