@@ -70,17 +70,27 @@ umask 022
 mkdir -p "$1"
 chown -h "$2" "$1"
 """
-# Refuse a path at which another account may put folders of its own: $1.
+# Refuse a path at which another account may put folders of its own: $1. The user's own group, as
+# Ubuntu makes it, has no other member.
 _OF_OTHERS = """\
-path=$1
-while :; do
-    for owner in $(stat -c %u "$path" 2>/dev/null; stat -Lc %u "$path" 2>/dev/null); do
-        [ "$owner" = 0 ] || [ "$owner" = "$(id -u)" ] || {
-            echo "$path belongs to another account: use another login user, or a workspace at" \
-                "another path" >&2; exit 1; }
+refuse() {
+    echo "$path $1: use another login user, or a workspace at another path" >&2
+    exit 1
+}
+user=$(id -un 2>/dev/null) group=0
+case $(getent group "$(id -g)") in
+    "$user":*: | "$user":*:"$user") group=$(id -g) ;;
+esac
+for path in "$1" "$(readlink -m "$1" || echo /)"; do
+    while :; do
+        for owner in $(stat -c %u "$path" 2>/dev/null; stat -Lc %u "$path" 2>/dev/null); do
+            [ "$owner" = 0 ] || [ "$owner" = "$(id -u)" ] || refuse 'belongs to another account'
+        done
+        [ -z "$(find -L "$path" -maxdepth 0 ! -perm -1000 '(' -perm -0002 -o -perm -0020 \
+            ! -gid 0 ! -gid "$group" ')' 2>/dev/null)" ] || refuse 'is open to other accounts'
+        [ "$path" != / ] || break
+        path=$(dirname "$path")
     done
-    [ "$path" != / ] || break
-    path=$(dirname "$path")
 done
 """
 
@@ -381,11 +391,12 @@ def make_folder(target: str, *, owned: bool) -> Command:
     :param owned: whether the launch owns the machine; else it may have accounts of others.
     """
     path = shlex.quote(target)
-    check = '' if owned else f'sh -c {shlex.quote(_OF_OTHERS)} sh {path} || exit\n'
-    return Command.script(
-        f'{check}[ -w {path} ] || mkdir -p {path} 2>/dev/null || '
-        f'sudo -n sh -ec {shlex.quote(_AS_ROOT)} sh {path} "$(id -u):$(id -g)"',
-        what='make a folder for the workspace')
+    script = (f'[ -w {path} ] || mkdir -p {path} 2>/dev/null || '
+              f'sudo -n sh -ec {shlex.quote(_AS_ROOT)} sh {path} "$(id -u):$(id -g)"')
+    if not owned:  # again at the end: in a folder such as /tmp, another account may be faster
+        check = f'sh -c {shlex.quote(_OF_OTHERS)} sh {path}'
+        script = f'{check} || exit\n{script} || exit\n{check}'
+    return Command.script(script, what='make a folder for the workspace')
 
 
 def _why_build(workspace: Workspace, machine: HostFacts, robot: HostFacts) -> str:

@@ -20,7 +20,7 @@ from fogros2.host.inspection import HostFacts, Python
 from fogros2.model import Command, Endpoint, MachineSpec, Result, SyncReport
 from fogros2.report import silent
 from fogros2.shell.local import LocalShell
-from fogros2.waiting import in_thread, Timeouts
+from fogros2.waiting import in_thread, Timeouts, wait_until
 from fogros2_testing.fakes import FakeProvider, FakeShell
 
 PYTHON = Python('/usr/bin/python3', (3, 12), True)
@@ -556,6 +556,50 @@ def test_folder_where_another_account_may_replace_it_is_refused(
         assert refused or (folder / target).stat().st_uid == 65533
     assert done.returncode == bool(refused)
     assert (f'{folder}/{refused} belongs to another account' in done.stderr) == bool(refused)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root can act as another user')
+@pytest.mark.parametrize(('mode', 'group', 'members', 'refused'), [
+    (0o2775, 65534, '', True), (0o777, 0, '', True), (0o1777, 0, '', False),
+    (0o775, 0, '', False), (0o775, 65533, '', False), (0o775, 65533, '65533', False),
+    (0o775, 65533, 'eve', True), (0o775, 65533, '65533,eve', True)])
+@pytest.mark.parametrize('target', ['open/robot/workspace', 'link/workspace'])
+def test_folder_that_other_accounts_may_replace_is_refused(
+    mode: int, group: int, members: str, refused: bool, target: str,
+) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        write(folder / 'bin/getent', f'#!/bin/sh\necho "65533:x:65533:{members}"\n', 0o755)
+        (folder / 'open/robot').mkdir(parents=True)
+        os.chown(folder / 'open', 0, group)
+        (folder / 'open').chmod(mode)
+        os.chown(folder / 'open/robot', 65533, 65533)
+        (folder / 'link').symlink_to('open/robot')
+        done = subprocess.run(
+            workspace.make_folder(f'{name}/{target}', owned=False).argv, user=65533, group=65533,
+            env={'PATH': f'{name}/bin:/usr/bin:/bin'}, capture_output=True, text=True)
+        assert (folder / target).exists() != refused
+    assert done.returncode == refused
+    assert (f'{folder}/open is open to other accounts' in done.stderr) == refused
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root can act as another user')
+def test_folder_that_another_account_makes_meanwhile_is_refused() -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o1777)
+        write(folder / 'bin/mkdir', f'#!/bin/sh\n: >{name}/now\n'
+              'until [ -k "$2" ]; do sleep 0.01; done\n', 0o755)
+        with subprocess.Popen(
+                workspace.make_folder(f'{name}/new', owned=False).argv, user=65533, group=65533,
+                env={'PATH': f'{name}/bin:/usr/bin:/bin'}, stderr=subprocess.PIPE) as child:
+            wait_until((folder / 'now').exists, timeout=60.0, what='the first check')
+            (folder / 'new').mkdir()
+            os.chown(folder / 'new', 65534, 65534)
+            (folder / 'new').chmod(0o1777)
+            _, said = child.communicate(timeout=60.0)
+    assert child.returncode == 1 and b'new belongs to another account' in said
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason='only root can give files away')
