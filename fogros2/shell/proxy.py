@@ -18,9 +18,25 @@ from fogros2.model import Command
 
 #: Seconds in which a program takes nothing until the connection counts as lost.
 STUCK = 60.0
+#: Maximum bytes of a packet of SSH; OpenSSH's is 256 kB.
+_PACKET = 1 << 19
 
 
-class ProxySocket(socket.socket):
+class PacketSocket(socket.socket):
+    """A socket for packets of SSH."""
+
+    def recv(self, size: int, flags: int = 0) -> bytes:
+        """
+        Receive.
+
+        :raises EOFError: the server announces a packet that would fill the memory.
+        """
+        if size > _PACKET:
+            raise EOFError(f'a packet of {size} bytes')
+        return super().recv(size, flags)
+
+
+class ProxySocket(PacketSocket):
     """Our end of the streams of a program, which ends with it."""
 
     child: subprocess.Popen[bytes]

@@ -34,12 +34,10 @@ KEX = ('curve25519-sha256@libssh.org', 'ecdh-sha2-nistp256', 'diffie-hellman-gro
 #: connection: it survives a cut of 30 s, and a robot with a new address connects again.
 KEEPALIVE = 15
 USER_TIMEOUT = 60
-#: Maximum bytes of a packet; OpenSSH's is 256 kB.
-_PACKET = 1 << 19
 _IMPORT = threading.Lock()
 
 
-class PromptSocket(socket.socket):
+class PromptSocket(proxy.PacketSocket):
     """
     A TCP socket that acknowledges at once.
 
@@ -48,13 +46,7 @@ class PromptSocket(socket.socket):
     """
 
     def recv(self, size: int, flags: int = 0) -> bytes:
-        """
-        Receive, and acknowledge at once.
-
-        :raises EOFError: the server announces a packet that would fill the memory.
-        """
-        if size > _PACKET:
-            raise EOFError(f'a packet of {size} bytes')
+        """Receive, and acknowledge at once."""
         data = super().recv(size, flags)
         if data:
             self.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)

@@ -15,7 +15,7 @@ import pytest
 
 from fogros2.errors import ConnectError, DeadlineExceeded
 from fogros2.model import Command, Endpoint
-from fogros2.shell import multiplexed, proxy
+from fogros2.shell import multiplexed, proxy, ssh_connection
 from fogros2.shell import multiplexer as mux
 from fogros2.shell.remote import MultiplexedShell
 from fogros2.shell.ssh import SSHShell
@@ -146,6 +146,14 @@ except Exception as error:
 raise SystemExit(print(peak() - before))
 shell.open"""), tmp_path)
     assert said == ['ConnectError'] and taken < LIMIT
+
+
+def test_packet_that_comes_through_a_proxy_takes_no_memory() -> None:
+    program = r"printf 'SSH-2.0-x\r\n\377\377\377\364'; exec cat /dev/zero"
+    with contextlib.closing(proxy.dial(Command(('sh', '-c', program)), 5.0)) as link, \
+            contextlib.closing(ssh_connection.transport_over(link)) as transport, \
+            pytest.raises(EOFError, match='a packet of'):
+        transport.start_client(timeout=10.0)
 
 
 #: Copies a folder to a machine whose rsync writes errors without end.
