@@ -15,7 +15,7 @@ from fogros2.errors import AgentError, CommandError, ConfigurationError, Deadlin
 from fogros2.model import Command
 from fogros2.shell import Shell
 from fogros2.store import Store
-from fogros2_monitor import addresses, credentials
+from fogros2_monitor import accounts, addresses, credentials
 from ros2fog_cli.api import machines
 from ros2fog_cli.api.machines import Entry
 
@@ -31,8 +31,10 @@ def on_robot(name: str) -> Optional[tuple[int, str]]:
     for path in folder.glob('monitor-*/*/token'):
         port = int(path.parts[-3].partition('-')[2])
         with contextlib.suppress(OSError), socket.create_connection(
-                ('127.0.0.1', port), timeout=_TIMEOUT):
-            return port, path.read_text().strip()
+                ('127.0.0.1', port), timeout=_TIMEOUT) as link:
+            # the gate may have found its port taken
+            if not accounts.is_strangers(link):
+                return port, path.read_text().strip()
     return None
 
 

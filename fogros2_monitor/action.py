@@ -171,7 +171,7 @@ def _on_robot(name: str, port: int, topics: Sequence[str]) -> list[LaunchDescrip
     process = AddedProcess(_bridge('robot', port, topics, [
         '--secrets', addresses.folder_of(str(folder), port, str(os.getpid()))]))
     return [process, _once_started(process, lambda: _logger().info(
-        f"{name}: Foxglove at {addresses.bridge('localhost', port)}; "
+        f"{name}: Foxglove at {addresses.bridge('127.0.0.1', port)}; "
         f'in a browser: ros2 fog monitor {name}')),
         RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: shutil.rmtree(
             folder, ignore_errors=True)))]

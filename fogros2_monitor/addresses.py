@@ -32,6 +32,15 @@ def application_port(port: int) -> int:
     return port + 2
 
 
+def loopback(port: int) -> str:
+    """
+    Return the address of a port of this computer.
+
+    Not with ``localhost``: a browser may try ``[::1]`` first, where another account may listen.
+    """
+    return f'127.0.0.1:{port}'
+
+
 def bridge(host: str, port: int) -> str:
     """Return a bridge's address without its token."""
     return f'ws://{host_port(host, port)}'

@@ -69,13 +69,12 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
     """Forward a port of this computer to the machine's bridge until Ctrl-C."""
     import contextlib
 
-    from fogros2.model import host_port
-    from fogros2_monitor import access, addresses
+    from fogros2_monitor import access
+    from fogros2_monitor.addresses import loopback, PORT, port_of
     from fogros2_monitor.browser import browser_at
     from fogros2_monitor.tunnel import Tunnel
     from ros2fog_cli.api import reach
-    remote_port = addresses.PORT if entry.record is None else addresses.port_of(
-        entry.record.notes)
+    remote_port = PORT if entry.record is None else port_of(entry.record.notes)
     if not remote_port:
         raise access.no_bridge(entry.name)
     with reach.session(entry) as shell:
@@ -87,7 +86,7 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
         with contextlib.closing(tunnel):
             try:
                 page = say(f'{entry.name} is at {{}} until Ctrl-C; in a browser:',
-                           host_port('localhost', tunnel.port), token)
+                           loopback(tunnel.port), token)
                 with browser_at(page, start=browser):
                     tunnel.ended.wait()
             except KeyboardInterrupt:
@@ -97,9 +96,9 @@ def serve(entry: Entry, port: int, browser: bool) -> int:
 
 def show_here(name: str, port: int, token: str, *, browser: bool) -> int:
     """Print the address of this computer's own bridge with its token, and open a browser."""
-    from fogros2.model import host_port
+    from fogros2_monitor.addresses import loopback
     from fogros2_monitor.browser import browser_at
-    page = say(f'{name} is at {{}}; in a browser:', host_port('localhost', port), token)
+    page = say(f'{name} is at {{}}; in a browser:', loopback(port), token)
     with browser_at(page, start=browser) as came:
         came.wait(TIMEOUT)
     return 0

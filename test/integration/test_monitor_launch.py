@@ -80,9 +80,9 @@ def tunnel(name: str) -> Iterator[str]:
         ['ros2', 'fog', 'monitor', name, '--no-browser'], stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, text=True, stdin=subprocess.DEVNULL)
     try:
-        url = re.search(r'is at (ws://localhost:\d+/\?token=\S+) ', process.stdout.readline())[1]
+        url = re.search(r'is at (ws://127.0.0.1:\d+/\?token=\S+) ', process.stdout.readline())[1]
         page = process.stdout.readline().strip()
-        assert page.startswith('http://localhost:') and page.endswith(url.partition('?')[2])
+        assert page.startswith('http://127.0.0.1:') and page.endswith(url.partition('?')[2])
         # the machine runs no containers, and so has no application
         with urllib.request.urlopen(page, timeout=60) as answer:
             assert html.escape(url) in answer.read().decode()
@@ -110,11 +110,11 @@ def test_monitor_works_for_a_machine_on_the_robot(nothing_left, tmp_path, state_
     file.write_text(ON_ROBOT)
     with launching() as launch:
         launched = launch(str(file), '--machine', 'planner=robot')
-        launched.wait_for('planner: Foxglove at ws://localhost:8765; in a browser: '
+        launched.wait_for('planner: Foxglove at ws://127.0.0.1:8765; in a browser: '
                           'ros2 fog monitor planner')
         launched.wait_for('serving ws://')
         told = ros2('fog', 'monitor', 'planner', '--no-browser').stdout
-        url = re.match(r'planner is at (ws://localhost:8765/\?token=(\S+)); in a browser:\n', told)
+        url = re.match(r'planner is at (ws://127.0.0.1:8765/\?token=(\S+)); in a browser:\n', told)
         sees_the_talker(url[1])
         assert knock(('localhost', 8765), '/', tls=False).startswith(b'HTTP/1.1 401 ')
         launched.interrupt()

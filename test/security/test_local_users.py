@@ -27,9 +27,10 @@ import pytest
 from fogros2 import process, ros2_daemon
 from fogros2.model import Command
 from fogros2.shell import relay
+from fogros2.store import Store
 from fogros2.waiting import in_thread, wait_until
 from fogros2_features.guests.program import Door
-from fogros2_monitor import accounts, request
+from fogros2_monitor import access, accounts, addresses, credentials, request, verbs
 from fogros2_monitor.browser import Ticket
 from fogros2_monitor.dashboard.server import Dashboard
 from fogros2_monitor.gate import Gate
@@ -345,6 +346,23 @@ def test_no_account_stands_for_bridge_or_application(
         assert child.stdout
         answer = loops.run(look(int(child.stdout.readline())))
     assert answer.startswith(b'HTTP/1.1 ' + status) and b'of another account' not in answer
+
+
+@pytest.mark.parametrize('theirs', [True, False])
+def test_no_account_stands_for_the_bridge_on_the_robot(
+    root: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str], theirs: bool,
+) -> None:
+    monkeypatch.setenv('FOGROS2_STATE_HOME', str(tmp_path))
+    with stranger(SQUAT) as child, socket.create_server(('127.0.0.1', 0)) as own:
+        assert child.stdout
+        port = int(child.stdout.readline()) if theirs else own.getsockname()[1]
+        token = credentials.make_token(Path(addresses.folder_of(
+            str(addresses.on_robot(Store(), 'planner')), port, '1'))).token.read_text().strip()
+        assert access.on_robot('planner') == (None if theirs else (port, token))
+    # for localhost, a browser may try [::1] first, where another account may listen
+    verbs.show_here('planner', port, token, browser=False)
+    assert f' ws://127.0.0.1:{port}/' in capsys.readouterr().out
 
 
 def test_no_account_takes_up_the_door_for_guests(

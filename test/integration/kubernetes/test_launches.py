@@ -226,7 +226,7 @@ def check_application(machine):
                               stdout=subprocess.PIPE)
     try:
         line = tunnel.stdout.readline()
-        address = re.search(r'is at ws://(localhost:\d+/\?token=\S+) ', line)[1]
+        address = re.search(r'is at ws://(127.0.0.1:\d+/\?token=\S+) ', line)[1]
         wait_until(shown, timeout=60.0, what='the application')
     finally:
         tunnel.send_signal(signal.SIGINT)
