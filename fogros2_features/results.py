@@ -201,6 +201,7 @@ def _copy(running: RunningMachine, folder: str, target: Path, *, size: int, limi
                 folder, target, known=None, limit=limit, timeout=TIMEOUT, cancel=late)
             return
         except (ConnectError, DeadlineExceeded):
+            late.is_set()  # raises an error when the time is over
             # a machine may take back what it has sent
             before, arrived = arrived, max(arrived, size_on_disk(target))
             failures = 1 if arrived > before else failures + 1

@@ -390,7 +390,9 @@ def test_copy_ends_at_a_time_that_follows_from_its_size(
     (home / 'bags').mkdir()
     running = FakeRunning()
 
-    def slow(source: str, *words: Any, cancel: Any, **more: Any) -> None:
+    def slow(source: str, target: Path, *, cancel: Any, **more: Any) -> None:
+        assert not list(target.iterdir()), 'one attempt'
+        (target / 'a little').touch()
         assert not cancel.is_set()
         begin = time.monotonic()
         later = begin + results.TIMEOUT + 1e9 / results.SLOWEST
