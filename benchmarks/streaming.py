@@ -480,8 +480,8 @@ def run(case: Case, launch: Any, machine: Any, link: Link, output: Output, count
         wait_until(lambda: {decoder, viewer} <= output.ended, timeout=60.0,
                    what='the nodes on the machine to end')
     counters = link.change(rate=0.0, delay=0.0, loss=0.0)
-    # no packet is larger than the VPN's 1420 bytes
-    if (counters['passed'] + counters['lost']) * 1420 < sent:
+    # no packet is larger than the VPN's 1280 bytes
+    if (counters['passed'] + counters['lost']) * 1280 < sent:
         raise RuntimeError(f'packets go past the relay: {counters}, {sent} bytes sent')
     try:
         quality = json.loads(machine.shell.run(Command(

@@ -292,7 +292,6 @@ class VpnInterface:
     network: str
     port: int
     key_file: str
-    mtu: int = 1420
     firewall: bool = False
     host_routes: bool = False
     process: str = ''

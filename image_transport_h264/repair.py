@@ -19,7 +19,7 @@ import zlib
 import numpy
 from numpy.typing import NDArray
 
-#: Bytes of a piece; with all headers it stays below the VPN's MTU of 1420 bytes.
+#: Bytes of a piece; with all headers it stays below the VPN's MTU of 1280 bytes.
 PIECE = 1100
 #: Number of pieces that share a parity.
 GROUP = 5

@@ -32,6 +32,7 @@ from fogros2 import untrusted
 from fogros2.dds import check_discovery, DdsVendor, local_only, static_peers
 from fogros2.errors import DdsError
 from fogros2.model import Command, DdsInterface
+from fogros2.vpn import MTU
 from fogros2.vpn.addresses import dds_ports
 
 #: Maximum number of ROS 2 processes of a host in a domain, limited by its ports.
@@ -56,10 +57,10 @@ HEARTBEAT = 20
 #: Requested receive buffer in bytes (a raw 1080p image is 6 MB in one burst). The kernel limits
 #: it to its rmem_max; a required minimum above that limit would fail.
 RECEIVE_BUFFER = 4 * 1024 * 1024
-#: Bytes of a fragment; MESSAGE: of a retransmission: what fits into 1420 bytes after IPv4 and UDP
+#: Bytes of a fragment; MESSAGE: of a retransmission: what fits into a packet after IPv4 and UDP
 #: (28), RTPS, INFO_DST, INFO_TS and DATA_FRAG (84).
-FRAGMENT = 1280
-MESSAGE = 1380
+FRAGMENT = MTU - 140
+MESSAGE = MTU - 40
 #: Settings that hosts have to share, in lower case: their values on machines.
 _SHARED: Mapping[str, Sequence[str]] = {
     'transport': ('udp', 'default'), 'spdpmulticastaddress': ('239.255.0.1',), 'tag': (),

@@ -37,6 +37,7 @@ from fogros2.dds import addresses_of, check_discovery, DdsVendor, local_only, st
 from fogros2.errors import DdsError
 from fogros2.model import DdsInterface
 from fogros2.store import check_owner
+from fogros2.vpn import MTU
 from fogros2.vpn.addresses import dds_ports, DISCOVERY_GROUP, multicast_group
 
 #: Environment variable with the path of Fast DDS's profiles.
@@ -53,11 +54,11 @@ ANNOUNCEMENT = 3
 LEASE_DURATION = 60
 #: Requested receive buffer in bytes; the kernel limits it to its rmem_max.
 RECEIVE_BUFFER = 4 * 1024 * 1024
-#: Bytes of a datagram: six packets of the VPN (1400 bytes each after IPv4, less UDP's 8). The
-#: default of 65500 is lost with any of its 47 packets: at 5 % loss, no message of 20 kB arrives.
+#: Bytes of a datagram: seven packets of the VPN (1256 bytes each after IPv4, less UDP's 8). The
+#: default of 65500 is lost with any of its 53 packets: at 5 % loss, no message of 20 kB arrives.
 #: Smaller ones cost processor time for large images. It is a property of writers, because a
 #: transport with a smaller size could not receive the datagrams of others.
-DATAGRAM = 6 * 1400 - 8
+DATAGRAM = 7 * ((MTU - 20) // 8 * 8) - 8
 #: Milliseconds after which a writer asks whether all samples have arrived (default 3000): without
 #: a following sample, a lost one is noticed only then. Writers ask only while samples are
 #: unacknowledged.

@@ -22,6 +22,9 @@ from collections.abc import Iterator, Sequence
 
 from fogros2.model import Command, Peer, VpnInterface
 
+#: Bytes of the largest packet in a VPN: with WireGuard's headers, it fits paths of 1360 bytes. A
+#: mobile network or a firewall may have such a path, and lose larger packets without a report.
+MTU = 1280
 #: What the commands of ``Vpn.leave`` print if the interface stays.
 STAYS = 'stays'
 

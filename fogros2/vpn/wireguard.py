@@ -21,7 +21,7 @@ import shlex
 
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
-from fogros2.vpn import addresses, STAYS, Vpn
+from fogros2.vpn import addresses, MTU, STAYS, Vpn
 from fogros2.vpn.addresses import DISCOVERY_GROUP
 
 #: Programs that each host needs, and their Debian and Ubuntu packages. ``wireguard-go`` is only
@@ -38,7 +38,7 @@ RTPS = 'meta l4proto udp @th,64,32 0x52545053'
 #: each 30 s or more often.
 LAN_TIMEOUT = '5m'
 #: Packets that may queue for ``wireguard-go``; the kernel's default is 500. A raw VGA image has
-#: 720 packets at once, and on a busy processor several images queue.
+#: 800 packets at once, and on a busy processor several images queue.
 QUEUE = 3000
 
 #: Shell text that turns ``wg show ... endpoints`` into requests to ``ip -batch``, one for each
@@ -521,7 +521,7 @@ def _address(interface: VpnInterface, peers: Sequence[Peer]) -> _Step:
     alone = ' noprefixroute' if interface.host_routes else ''
     lines = [
         f'address replace {interface.address}/{prefix} dev {name}{alone}',
-        f'link set dev {name} mtu {interface.mtu} multicast on txqueuelen {QUEUE} up']
+        f'link set dev {name} mtu {MTU} multicast on txqueuelen {QUEUE} up']
     do = f'{_print(lines)} | ip -batch -'
     own = [_free(interface, interface.address)] if interface.host_routes else []
     return _Step('\n'.join([*own, do, *_routes(interface, peers)]))

@@ -293,6 +293,9 @@ def test_lost_messages_are_repeated_within_milliseconds() -> None:
     assert texts(root, 'HeartbeatInterval') == ['20 ms']
     assert attributes(root, 'HeartbeatInterval') == [
         {'min': '5 ms', 'minsched': '10 ms', 'max': '1 s'}]
+    # each fits into one packet of the VPN
+    assert texts(root, 'FragmentSize') == ['1140 B']
+    assert texts(root, 'MaxRexmitMessageSize') == ['1240 B']
 
 
 def test_the_environment_holds_our_file(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_losses_cost_a_few_packets_and_no_flood() -> None:
     root = parsed(robot(FastDds()))
     assert [(one.findtext('name', '', NS), one.findtext('value', '', NS))
             for one in root.iterfind('.//rtps/propertiesPolicy/properties/property', NS)] == [
-        ('fastdds.max_message_size', '8392')]
+        ('fastdds.max_message_size', '8784')]
     default = next(one for one in root.iterfind('.//data_writer', NS)
                    if one.get('is_default_profile') == 'true')
     assert default.findtext('times/heartbeatPeriod/nanosec', '', NS) == '200000000'

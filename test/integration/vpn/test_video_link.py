@@ -175,7 +175,7 @@ def receive_buffers() -> Iterator[None]:
 
 
 def test_raw_best_effort_images_arrive_whole(receive_buffers: None, lab: Any) -> None:
-    """Each has 720 packets in one burst; not one may be lost, as none comes again."""
+    """Each has 800 packets in one burst; not one may be lost, as none comes again."""
     lab.link('robot', 'e9', '192.0.2.10/24', 'machine', 'e9', '192.0.2.11/24')
     lab.connect(f"192.0.2.11:{lab.interfaces['machine'].port}")
     viewer = start(lab, 'machine', str(HERE / 'video_node.py'), 'viewer', 'best_effort')

@@ -111,6 +111,18 @@ def test_up_carries_and_down_leaves_nothing_of_ours(vpn: Lab, tmp_path: Path) ->
     assert others['lan'].process.poll() is None
 
 
+def test_full_packets_cross_a_path_that_loses_large_ones(lab: Lab) -> None:
+    """As in mobile networks: 1400 bytes at the most, and no ICMP message about larger packets."""
+    lab.link('robot', 'e9', '192.0.2.10/24', 'machine', 'e9', '192.0.2.11/24')
+    for host in ('robot', 'machine'):
+        lab.shell(host, 'nft "add table ip path; add chain ip path in { type filter hook '
+                        'prerouting priority -500; }; add rule ip path in iifname e9 '
+                        'meta length > 1400 drop"')
+    lab.connect(f"192.0.2.11:{lab.interfaces['machine'].port}")
+    wait_until(lambda: lab.ping('robot', MACHINE), timeout=20.0, what='an echo')
+    lab.run('robot', Command(('ping', '-n', '-q', '-c1', '-i0.2', '-w8', '-s1300', MACHINE)))
+
+
 @pytest.fixture(scope='module')
 def shared(tun: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     """Have a VPN for tests that leave it as it is."""
