@@ -25,6 +25,7 @@ from fogros2.deploy.robot import (
     check_net_admin,
     check_robot,
     check_sudo,
+    firewall_trouble,
     kernel_wireguard,
     provider,
     ROBOT_PROGRAMS,
@@ -34,6 +35,6 @@ from fogros2.deploy.robot import (
 from fogros2.deploy.running import RunningMachine
 
 __all__ = [
-    'check_net_admin', 'check_robot', 'check_sudo', 'kernel_wireguard', 'Launch', 'provider',
-    'ROBOT_PROGRAMS', 'RunningMachine', 'TUN', 'TUN_REMEDY',
+    'check_net_admin', 'check_robot', 'check_sudo', 'firewall_trouble', 'kernel_wireguard',
+    'Launch', 'provider', 'ROBOT_PROGRAMS', 'RunningMachine', 'TUN', 'TUN_REMEDY',
 ]

@@ -29,7 +29,7 @@ from fogros2.deploy.checks import (
 from fogros2.deploy.choosing import Choices
 from fogros2.deploy.context import Context, programs_of
 from fogros2.deploy.deployment import bring_up
-from fogros2.deploy.robot import check_robot, clear, provider, run
+from fogros2.deploy.robot import check_robot, clear, firewall_trouble, provider, run
 from fogros2.deploy.robot_vpn import choose_interface, RobotVpn
 from fogros2.deploy.running import RunningMachine
 from fogros2.deploy.undo import UndoStack
@@ -310,6 +310,10 @@ class Launch:
                     write_private(path.with_name('domain'), str(self.domain).encode())
                     write_private(path.with_name('rmw'), vendor.rmw.encode())
                 vpn.ensure()
+                with contextlib.suppress(FogError):
+                    # sudo would log a refusal for each user of the helper
+                    if not vpn.helped and (trouble := firewall_trouble()):
+                        self.report(Warned('', *trouble))
                 router = vendor.router(
                     vpn.interface.address,
                     [self._address(index) for index in range(robot_router.MACHINES)], user)

@@ -112,6 +112,32 @@ def check_sudo(*, ask: bool = False) -> None:
                                 f'{remedy}, or have an administrator {helper}')
 
 
+def firewall_trouble() -> Optional[tuple[str, str]]:
+    """
+    Return why the user's firewall may drop what comes through the VPN, and a remedy.
+
+    :raises FogError: the firewall cannot be looked at.
+    """
+    rules = process.run(Command(('nft', '--terse', 'list', 'ruleset'), sudo=True),
+                        timeout=10.0).stdout
+    chains = dict.fromkeys(
+        chain for table, text in re.findall(
+            r'^table (?:ip|inet) (\S+) \{\n(.*?)^\}', rules, re.MULTILINE | re.DOTALL)
+        if not table.startswith('fog')
+        for chain, policy, rest in re.findall(
+            r'^\tchain (\S+) \{\n\t\ttype filter hook input[^;]*; policy (\w+);\n(.*?)^\t\}',
+            text, re.MULTILINE | re.DOTALL)
+        if policy == 'drop' or re.search(
+            r'^\t\t(counter packets \d+ bytes \d+ )?(drop|reject( with [^\n]*)?)\n\Z',
+            rest, re.MULTILINE))
+    if not chains or re.search(r'iifname "fog\*" .*(accept|(goto|jump) \S*trusted)', rules):
+        return None
+    return (f"this computer's firewall ({', '.join(chains)}) refuses by default: it has to let in "
+            'DDS and ping from the interfaces fog*, or no topic of a machine arrives',
+            'sudo ufw allow in on fog+ (firewalld: firewall-cmd --zone=trusted '
+            '--add-interface=fog+; else: nft insert rule inet filter input iifname "fog*" accept)')
+
+
 def clear(folder: Path) -> None:
     """
     Delete the VPN interface, firewall rules, key and folder of a dead launch; idempotent.

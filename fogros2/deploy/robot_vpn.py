@@ -80,8 +80,10 @@ class RobotVpn:
         self._poll_interval = POLL_INTERVAL
         #: Why the last health check or repair failed, '' if it did not.
         self._failure = ''
+        #: Whether the helper makes the interface.
+        self.helped = helped.made(interface)
         # the helper needs no ticket; container machines then refresh one that is there
-        self._ticket = not helped.made(interface) or process.sudo_trouble() is None
+        self._ticket = not self.helped or process.sudo_trouble() is None
         self._ticket_valid = True
         self._ticket_refreshed = time.monotonic()
 
@@ -136,7 +138,7 @@ class RobotVpn:
 
     def _note_owner(self) -> None:
         """Let gc recognise the interface; the helper knows whose its interfaces are."""
-        if not helped.made(self.interface):
+        if not self.helped:
             process.run(owner.note(self.interface), timeout=self._timeout, check=False)
 
     def peers_of(self, member: VpnMember) -> list[Peer]:

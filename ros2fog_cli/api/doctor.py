@@ -12,7 +12,6 @@ import importlib.util
 import os
 from pathlib import Path
 import platform
-import re
 import sys
 import threading
 from typing import Literal, Optional
@@ -326,31 +325,12 @@ def ssh_keys() -> Check:
 def firewall() -> Check:
     """Check whether a firewall of the user may block the VPN."""
     try:
-        result = process.run(Command(('nft', 'list', 'ruleset'), sudo=True), timeout=10.0,
-                             check=False)
+        trouble = deploy.firewall_trouble()
     except FogError as error:
         return Check('firewall', 'warning', f'can not be looked at: {error.args[0]}', error.hint)
-    if result.returncode != 0:
-        return Check('firewall', 'warning', 'can be looked at by root alone')
-    chains = [
-        chain for table, text in re.findall(
-            r'^table \S+ (\S+) \{\n(.*?)^\}', result.stdout, re.MULTILINE | re.DOTALL)
-        if not table.startswith('fog')
-        for chain, policy, rules in re.findall(
-            r'^\tchain (\S+) \{\n\t\ttype filter hook input[^;]*; policy (\w+);\n(.*?)^\t\}',
-            text, re.MULTILINE | re.DOTALL)
-        if policy == 'drop' or re.search(
-            r'^\t\t(counter packets \d+ bytes \d+ )?(drop|reject( with [^\n]*)?)\n\Z',
-            rules, re.MULTILINE)]
-    if not chains:
-        return Check('firewall', 'ok', 'lets in by default')
-    if re.search(r'iifname "fog\*" .*(accept|(goto|jump) \S*trusted)', result.stdout):
-        return Check('firewall', 'ok', 'lets in what comes through the VPN')
-    return Check(
-        'firewall', 'warning', f"the chain {', '.join(chains)} refuses by default: it has to let "
-        'in DDS and ping from the interfaces fog*', 'nft insert rule inet filter input iifname '
-        '"fog*" accept (or, for ufw: what `ufw allow in on` takes; for firewalld: firewall-cmd '
-        '--zone=trusted --add-interface=fog+)')
+    if trouble is not None:
+        return Check('firewall', 'warning', *trouble)
+    return Check('firewall', 'ok', 'lets in what comes through the VPN')
 
 
 def state() -> Check:

@@ -126,6 +126,7 @@ FIREWALLD = (CHAIN % 'ct state { established, related } accept\n\t\tjump zones\n
     (FIREWALLD.replace('inet filter', 'inet foga1b2c3'), 'ok'),
     (FIREWALLD.replace('jump zones', 'iifname "fog*" goto filter_IN_trusted'), 'ok'),
     (CHAIN % 'iifname "fog*" accept', 'ok'), ('', 'ok'),
+    (CHAIN.replace('inet', 'ip6') % 'ct state established accept', 'ok'),
     (PrerequisiteError('sudo not found on this computer', 'install it'), 'warning')])
 def test_dropping_firewall_is_reported(
     monkeypatch: pytest.MonkeyPatch, answer: str | Exception, verdict: str,

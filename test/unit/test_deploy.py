@@ -318,6 +318,14 @@ def test_robot_asks_machines_and_names_its_middleware(launch, events, monkeypatc
             if isinstance(one, StepDone) and one.step == 'middleware'] == ['rmw_fastrtps_cpp']
 
 
+def test_launch_warns_of_a_firewall_that_drops_topics(launch, events, monkeypatch):
+    trouble = 'the firewall refuses', 'allow in on fog+'
+    monkeypatch.setattr(deployed, 'check_robot', lambda: None)
+    monkeypatch.setattr(deployed, 'firewall_trouble', lambda: trouble)
+    launch.robot_environment()
+    assert events.count(Warned('', *trouble)) == 1
+
+
 def refusal():
     error = ProviderError('your token has expired')
     error.refused = True
