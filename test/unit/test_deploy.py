@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import os
 from pathlib import Path
+import re
 import signal
 import socket
 import threading
@@ -324,6 +325,22 @@ def test_launch_warns_of_a_firewall_that_drops_topics(launch, events, monkeypatc
     monkeypatch.setattr(deployed, 'firewall_trouble', lambda: trouble)
     launch.robot_environment()
     assert events.count(Warned('', *trouble)) == 1
+
+
+@pytest.mark.parametrize(('handshake', 'device', 'words'), [
+    (0.0, '', 'is UDP port 51999 open'), (1.8e9, '', "a firewall of 'planner'"),
+    (1.8e9, 'other', 'dev other .*: sudo ip rule add pref 100 to 198.18.0.0/15 lookup main')])
+def test_cause_of_a_silent_vpn_depends_on_the_handshake(
+        launch, provider, monkeypatch, handshake, device, words):
+    context, mine = begun(launch)
+    own = context.vpn.interface
+    mine.interface = dataclasses.replace(own, address='198.18.7.2', port=51999)
+    mine.record = dataclasses.replace(mine.record, public_key='KEY')
+    counters = {'KEY': {'handshake': handshake}}
+    monkeypatch.setattr(FakeVpn, 'parse_status', lambda vpn, text: counters)
+    monkeypatch.setattr(arming, 'run', lambda commands, timeout:
+                        f'198.18.7.2 dev {device or own.name} src {own.address}')
+    assert re.search(words, Arming(context, mine)._cause())
 
 
 def refusal():

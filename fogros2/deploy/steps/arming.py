@@ -13,6 +13,7 @@ from typing import Any, Optional
 from fogros2 import model, plan
 from fogros2.agent_client import agent_program, AgentClient, Heartbeat, interval_for
 from fogros2.deploy.machine_job import AGENT_FOLDER, Step
+from fogros2.deploy.robot import run
 from fogros2.deploy.undo import first_config, NODES, WATCHDOG
 from fogros2.errors import (
     AgentAbsent,
@@ -22,7 +23,8 @@ from fogros2.errors import (
     FogError,
     VpnError,
 )
-from fogros2.model import Command
+from fogros2.model import Command, VpnInterface
+from fogros2.vpn import addresses
 from fogros2.waiting import Periodic, wait_until
 
 # Install and start the agent in one round trip. Standard input is the configuration in one line,
@@ -249,7 +251,44 @@ class Arming(Step):
                 raise
             raise VpnError(
                 f"nothing comes back from '{job.name}' through the VPN",
-                '; '.join([f'is UDP port {job.interface.port} open on the way there?',
-                           *job.advice])) from error
+                '; '.join([self._cause(), *job.advice])) from error
         if job.rearming is not None:
             job.rearming.close()
+
+    def _cause(self) -> str:
+        """Return why nothing may come back through the VPN."""
+        context, job, robot = self._context, self._job, self._context.vpn
+        handshake, route = False, ''
+        with contextlib.suppress(FogError):
+            status = run([robot.vpn.status(robot.interface)], timeout=context.timeouts.command)
+            peer = robot.vpn.parse_status(status).get(job.record.public_key)
+            handshake = peer is not None and peer['handshake'] > 0
+            route = run([route_to(job.interface.address)], timeout=context.timeouts.command)
+        return cause(job.name, job.interface, robot.interface, handshake=handshake, route=route,
+                     pool=addresses.pool_from(context.environment))
+
+
+def route_to(address: str) -> Command:
+    """Return the command that prints the interface of packets to an address."""
+    return Command(('ip', '-4', 'route', 'get', address), what='look at the route')
+
+
+def cause(
+    name: str, machine: VpnInterface, robot: VpnInterface, *, handshake: bool, route: str,
+    pool: str,
+) -> str:
+    """
+    Return why nothing may come back from a machine through the VPN, and the remedy.
+
+    :param handshake: whether WireGuard's packets come back.
+    :param route: output of :func:`route_to`, '' if unknown.
+    :param pool: of the VPN's networks (CIDR).
+    """
+    if not handshake:
+        return f'is UDP port {machine.port} open on the way there?'
+    if route and f' dev {robot.name} ' not in route:
+        return ('a routing rule of this computer (as of another VPN) sends the packets elsewhere: '
+                f'{route.splitlines()[0].strip()}; try: sudo ip rule add pref 100 to {pool} '
+                'lookup main')
+    return (f"WireGuard's own packets come back, so a firewall of '{name}' may drop what comes "
+            'through the VPN; for ufw, run there: sudo ufw allow in on fog+')

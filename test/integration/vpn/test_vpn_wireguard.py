@@ -14,8 +14,10 @@ import pytest
 
 from fogros2 import process
 from fogros2.dds.zenoh import Zenoh
+from fogros2.deploy.steps.arming import cause, route_to
 from fogros2.errors import CommandError
 from fogros2.model import Command, Peer
+from fogros2.vpn import addresses
 from fogros2.vpn.wireguard import WireGuard
 from fogros2.waiting import wait_until
 from rigs.vpn_lab import Lab, MACHINE, opened, ROBOT
@@ -121,6 +123,29 @@ def test_full_packets_cross_a_path_that_loses_large_ones(lab: Lab) -> None:
     lab.connect(f"192.0.2.11:{lab.interfaces['machine'].port}")
     wait_until(lambda: lab.ping('robot', MACHINE), timeout=20.0, what='an echo')
     lab.run('robot', Command(('ping', '-n', '-q', '-c1', '-i0.2', '-w8', '-s1300', MACHINE)))
+
+
+def test_routing_rule_that_takes_the_vpns_packets_is_named(shared: Lab) -> None:
+    """As Tailscale's with an exit node: its table has a default route, and comes first."""
+    machine, robot = shared.interfaces['machine'], shared.interfaces['robot']
+
+    def found(handshake: bool = True) -> str:
+        return cause('lab', machine, robot, handshake=handshake, pool=addresses.POOL,
+                     route=shared.run('robot', route_to(MACHINE)).stdout)
+
+    assert shared.handshaken() and "a firewall of 'lab'" in found()
+    assert found(handshake=False) == f'is UDP port {machine.port} open on the way there?'
+    shared.shell('robot', 'ip link add other type veth peer name o1; ip link set other up')
+    try:
+        shared.shell('robot', 'ip link set o1 up; ip route add default dev other table 52; '
+                              'ip rule add pref 5270 lookup 52')
+        assert not shared.ping('robot', MACHINE, timeout=1.0)
+        assert f'{MACHINE} dev other' in found()
+        shared.shell('robot', found().partition('sudo ')[2])
+        assert shared.ping('robot', MACHINE) and 'dev other' not in found()
+    finally:
+        shared.shell('robot', 'ip link delete other; ip rule delete pref 5270; '
+                              'ip rule delete pref 100', check=False)
 
 
 @pytest.fixture(scope='module')
