@@ -32,7 +32,7 @@ from fogros2.model import (
 )
 from fogros2.provider import Attached, Capabilities, Provider
 from fogros2.provider.options import parsed
-from fogros2.shell import connect, ssh_config
+from fogros2.shell import connect, ssh_config, ssh_connection
 
 _SCHEME = 'ssh:'
 #: Seconds after which a computer without an answer counts as off.
@@ -221,8 +221,9 @@ def reach(settings: ssh_config.Settings) -> str:
     :raises OSError: no answer, or no address.
     """
     if settings.proxy:
-        return _address(socket.getaddrinfo(settings.host, settings.port)[0][4])
-    with socket.create_connection((settings.host, settings.port), timeout=_TIMEOUT) as connection:
+        return _address(socket.getaddrinfo(
+            settings.host, settings.port, settings.family)[0][4])
+    with ssh_connection.open_socket(settings, _TIMEOUT) as connection:
         return _address(connection.getpeername())
 
 

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 import pwd
 import re
+import socket
 
 from fogros2 import process
 from fogros2.errors import ConfigurationError, ShellError
@@ -15,6 +16,7 @@ from fogros2.model import Command, Endpoint
 
 _KEYS = ('~/.ssh/id_ed25519', '~/.ssh/id_ecdsa', '~/.ssh/id_rsa')
 _KNOWN_HOSTS = ('~/.ssh/known_hosts', '/etc/ssh/ssh_known_hosts')
+_FAMILIES = {'inet': socket.AF_INET, 'inet6': socket.AF_INET6}
 #: Seconds for the evaluation, which may run the commands of ``Match exec``.
 _TIMEOUT = 10.0
 #: Characters that end a value. An unpaired quote in a file ends ssh, for all hosts.
@@ -33,6 +35,7 @@ class Settings:
     :param proxy: command whose streams replace the TCP connection.
     :param known_hosts: files, of which some may not exist.
     :param label: name in these files, instead of the host and port.
+    :param family: the only family of addresses, if it is one.
     """
 
     host: str
@@ -44,6 +47,7 @@ class Settings:
     proxy: tuple[str, ...] = ()
     known_hosts: tuple[str, ...] = _KNOWN_HOSTS
     label: str = ''
+    family: socket.AddressFamily = socket.AF_UNSPEC
 
 
 def of(endpoint: Endpoint) -> Settings:
@@ -108,7 +112,8 @@ def read(name: str, user: str = '', port: int = 0) -> Settings:
         proxy=_proxy(first('proxyjump'), expanded(first('proxycommand')), host, number, files),
         known_hosts=tuple(re.sub(f'^{re.escape(account.pw_dir)}/[.]ssh/', f'{home}/.ssh/',
                                  file) for file in known),
-        label=first('hostkeyalias'))
+        label=first('hostkeyalias'),
+        family=_FAMILIES.get(first('addressfamily'), socket.AF_UNSPEC))
 
 
 def _proxy(

@@ -145,7 +145,7 @@ def connect(endpoint: Endpoint, *, name: str, timeout: float) -> paramiko.Transp
 def _dial(settings: Settings, name: str, timeout: float) -> PromptSocket:
     where = f"'{name}' ({settings.host} port {settings.port})"
     try:
-        plain = socket.create_connection((settings.host, settings.port), timeout=timeout)
+        sock = open_socket(settings, timeout)
     except socket.gaierror as error:
         if error.errno == socket.EAI_AGAIN:
             raise ConnectError(f"'{name}': no DNS server answers for '{settings.host}'",
@@ -160,12 +160,34 @@ def _dial(settings: Settings, name: str, timeout: float) -> PromptSocket:
     except OSError as error:
         raise ConnectError(f'{where} can not be reached: {error.strerror or error}',
                            "check the robot's network") from error
-    sock = PromptSocket(plain.family, plain.type, plain.proto, fileno=plain.detach())
     sock.settimeout(timeout)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT * 1000)
     flow.keep_prompt(sock)
     return sock
+
+
+def open_socket(settings: Settings, timeout: float) -> PromptSocket:
+    """
+    Connect to a host; each address gets its share of the time, as one may lead nowhere.
+
+    :param timeout: seconds for all addresses together.
+    :raises OSError: that of the last address.
+    """
+    end = time.monotonic() + timeout
+    found = socket.getaddrinfo(
+        settings.host, settings.port, settings.family, socket.SOCK_STREAM)
+    for rest, (family, kind, protocol, _, address) in zip(range(len(found), 0, -1), found):
+        sock = PromptSocket(family, kind, protocol)
+        try:
+            sock.settimeout(max(0.1, (end - time.monotonic()) / rest))
+            sock.connect(address)
+            return sock
+        except OSError:
+            sock.close()
+            if rest == 1:
+                raise
+    raise OSError('the host has no address')
 
 
 def _choose(transport: paramiko.Transport, known: Known) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 import socket
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -96,6 +97,29 @@ def test_a_computer_that_can_t_be_reached_is_refused_at_once(
     SSHProvider().check(spec)
 
 
+def test_address_that_leads_nowhere_takes_half_of_the_time(monkeypatch, listener):
+    """As that of IPv6 in a network without; SSH connects to the other one."""
+    families = []
+    with contextlib.ExitStack() as opened:
+        # takes one connection, and does not answer others
+        dead = opened.enter_context(socket.create_server(('127.0.0.1', 0), backlog=0))
+        opened.enter_context(socket.create_connection(dead.getsockname()))
+
+        def look_up(host, port, family=0, *_, **__):
+            families.append(family)
+            return [(socket.AF_INET, socket.SOCK_STREAM, 0, '', server.getsockname())
+                    for server in (dead, listener)]
+
+        monkeypatch.setattr(socket, 'getaddrinfo', look_up)
+        begin = time.monotonic()
+        sock = ssh_connection._dial(
+            ssh_config.Settings('lab', family=socket.AF_INET), 'lab', 2.0)
+        with sock:
+            assert sock.getpeername() == listener.getsockname() and sock.gettimeout() == 2.0
+    assert families == [socket.AF_INET]
+    assert 0.5 < time.monotonic() - begin < 2.0
+
+
 @pytest.mark.parametrize('proxy', ['', 'jump'])
 @pytest.mark.parametrize(('peer', 'expected'), [
     (('fe80::1', 22, 0, 1), 'fe80::1%lo'), (('2001:db8::1', 22, 0, 0), '2001:db8::1'),
@@ -105,7 +129,7 @@ def test_link_local_address_names_its_interface(monkeypatch, proxy, peer, expect
         def __enter__(self):
             return SimpleNamespace(getpeername=lambda: peer)
 
-    monkeypatch.setattr(socket, 'create_connection', lambda *_, **__: Connection())
+    monkeypatch.setattr(ssh_connection, 'open_socket', lambda *_: Connection())
     monkeypatch.setattr(socket, 'getaddrinfo', lambda *_: [(None, None, None, '', peer)])
     monkeypatch.setattr(socket, 'if_indextoname', {1: 'lo'}.__getitem__)
     assert reach(ssh_config.Settings('host', proxy=proxy)) == expected

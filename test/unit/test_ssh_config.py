@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import getpass
+import socket
 
 import pytest
 
@@ -39,12 +40,13 @@ Host lab lab2
   IdentityAgent /run/agent.sock
   UserKnownHostsFile ~/.ssh/of_lab /etc/of_lab
   HostKeyAlias gpu
+  AddressFamily inet
 Match originalhost lab2 exec "test -e {home}/more"
   Port 2300
 """)
     assert ssh_config.read('lab') == ssh_config.Settings(
         '198.51.100.7', 2299, 'fog', ('~/keys/198.51.100.7_fog%', '~/keys/a key'),
-        only_keys=True, agent='/run/agent.sock', label='gpu', known_hosts=(
+        only_keys=True, agent='/run/agent.sock', label='gpu', family=socket.AF_INET, known_hosts=(
             f'{home}/.ssh/of_lab', '/etc/of_lab', '/etc/ssh/ssh_known_hosts',
             '/etc/ssh/ssh_known_hosts2'))
     assert ssh_config.read('lab2').port == 2300
