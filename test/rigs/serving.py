@@ -23,13 +23,13 @@ def server(app: Any, host: str = '127.0.0.1', port: int = 0, **words: Any) -> An
 
 
 @contextlib.contextmanager
-def serve(app: Any) -> Iterator[str]:
+def serve(app: Any, **words: Any) -> Iterator[str]:
     """Serve an application on the loopback in the block; yields its address."""
-    one = server(app)
+    one = server(app, **words)
     thread = threading.Thread(target=one.serve_forever, args=(0.02,), daemon=True)
     thread.start()
     try:
-        yield f'http://127.0.0.1:{one.port}'
+        yield f"http{'s' if 'ssl_context' in words else ''}://127.0.0.1:{one.port}"
     finally:
         one.shutdown()
         thread.join()

@@ -18,6 +18,7 @@ import pwd
 import re
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -342,6 +343,34 @@ def test_robot_address_is_asked_once_for_all_machines(echo):
     own = address.RobotAddress()
     assert own() == own() == '198.51.100.7/32'
     assert not said
+
+
+@pytest.mark.parametrize('variable', address.BUNDLE_VARIABLES)
+def test_robot_address_is_asked_through_a_proxy_that_reads_tls(tmp_path, monkeypatch, variable):
+    """Its authority is where the clouds' libraries look for it, and not the system's."""
+    certificate, key = tmp_path / 'crt', tmp_path / 'key'
+    subprocess.run([
+        'openssl', 'req', '-x509', '-newkey', 'rsa:2048', '-nodes', '-keyout', key, '-out',
+        certificate, '-subj', '/CN=proxy', '-addext', 'subjectAltName=IP:127.0.0.1'],
+        check=True, capture_output=True)
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    tls.load_cert_chain(certificate, key)
+
+    def answer(environ, start_response):
+        start_response('200 OK', [])
+        return [b'198.51.100.7']
+
+    monkeypatch.delenv(address.ADDRESS_VARIABLE, raising=False)
+    monkeypatch.setattr(address, 'has_ipv4', lambda: True)
+    with serving.serve(answer, ssl_context=tls) as url:
+        monkeypatch.setenv(address.CHECKIP_VARIABLE, url)
+        with pytest.raises(ProviderError, match='CERTIFICATE_VERIFY_FAILED'):
+            address.RobotAddress()()
+        monkeypatch.setenv(variable, str(certificate))
+        assert address.RobotAddress()() == '198.51.100.7/32'
+        monkeypatch.setenv(variable, str(tmp_path / 'none'))
+        with pytest.raises(ProviderError, match=address.ADDRESS_VARIABLE):
+            address.RobotAddress()()
 
 
 def test_a_robot_with_ipv6_is_let_in_by_that_too(echo, monkeypatch):

@@ -18,6 +18,8 @@ from fogros2.provider.vm.options import cidr
 ADDRESS_VARIABLE = 'FOGROS2_ROBOT_ADDRESS'
 #: Service that returns the address of the caller, and the variable that names another one.
 CHECKIP, CHECKIP_VARIABLE = 'https://checkip.amazonaws.com', 'FOGROS2_AWS_CHECKIP'
+#: Name files or folders with certificates of authorities.
+BUNDLE_VARIABLES = 'REQUESTS_CA_BUNDLE', 'AWS_CA_BUNDLE'
 #: Seconds for which an answer is used again, so that machines of one launch ask once.
 ADDRESS_AGE = 5.0
 #: Public addresses, to which the system chooses a route; nothing is sent.
@@ -58,10 +60,16 @@ class RobotAddress:
     def _ask(self, url: str) -> str:
         # ssl and email too: 10 ms that a listing does not need
         from http.client import HTTPException
+        import ssl
         import urllib.request
         hint = f'{ADDRESS_VARIABLE}=... names it'
         try:
-            with urllib.request.urlopen(url, timeout=5.0) as answer:
+            # beside the system's authorities those of a proxy, which the clouds' libraries read
+            trust = ssl.create_default_context()
+            for bundle in filter(None, map(os.environ.get, BUNDLE_VARIABLES)):
+                trust.load_verify_locations(
+                    **{'capath' if os.path.isdir(bundle) else 'cafile': bundle})
+            with urllib.request.urlopen(url, timeout=5.0, context=trust) as answer:
                 text = answer.read(100).decode('ascii', 'replace').strip()
         except (OSError, HTTPException, ValueError) as error:
             # a computer without IPv4 reaches only machines with IPv6
