@@ -299,8 +299,10 @@ class Api:
         configuration = self._client.configuration
         if proxy := configuration.proxy:
             parts = urlsplit(proxy)
-            options.update(http_proxy_host=parts.hostname, http_proxy_port=parts.port,
-                           proxy_type='http')
+            # a proxy of SOCKS needs the package python-socks, as the error of websocket says
+            options.update(http_proxy_host=parts.hostname, http_proxy_port=parts.port or 80,
+                           http_proxy_timeout=timeout, proxy_type=(
+                               parts.scheme if parts.scheme.startswith('socks') else 'http'))
             if parts.username:
                 options['http_proxy_auth'] = (parts.username, parts.password or '')
         url = self._url(path, query).replace('http', 'ws', 1)

@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from typing import Any
+from unittest.mock import Mock
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -467,6 +468,21 @@ def test_refused_exec_is_reported(api, server, monkeypatch, old):
     error = raised(ApiError, lambda: api.websocket('/exec', {}, timeout=5.0))
     assert error.status == 500
     assert ('container not running' in str(error)) is body
+
+
+@pytest.mark.parametrize(('proxy', 'kind', 'port'), [
+    ('http://me:pw@127.0.0.1:3128', 'http', 3128), ('http://127.0.0.1', 'http', 80),
+    ('socks5://127.0.0.1:1080', 'socks5', 1080), ('socks5h://127.0.0.1:1080', 'socks5h', 1080)])
+def test_exec_uses_the_proxy_of_the_kubeconfig(api, monkeypatch, proxy, kind, port):
+    import websocket
+    connect = Mock(side_effect=OSError('no proxy'))
+    monkeypatch.setattr(websocket, 'create_connection', connect)
+    api._client.configuration.proxy = proxy
+    raised(Unreachable, lambda: api.websocket('/exec', {}, timeout=5.0))
+    options = connect.call_args.kwargs
+    assert (options['proxy_type'], options['http_proxy_host'], options['http_proxy_port']) == (
+        kind, '127.0.0.1', port)
+    assert options.get('http_proxy_auth') == (('me', 'pw') if '@' in proxy else None)
 
 
 def test_the_provider_is_there_without_the_client():
