@@ -159,6 +159,9 @@ class RunningMachine(ReachedMachine, Protocol):
     def lose_after(self, seconds: float) -> None:
         """Count a silent machine as lost after this time, even if its provider says it runs."""
 
+    def bear_silence(self, seconds: float) -> None:
+        """Count a machine as lost only after this time without a word of it and its provider."""
+
 
 class VpnLink(Protocol):
     """

@@ -68,6 +68,8 @@ class MachineJob(Site):
         self.claimed = time.monotonic()
         #: Seconds of silence after which it is lost, whatever its provider reports.
         self.longest_silence: Optional[float] = None
+        #: Seconds for which it is not lost, if its provider reports nothing either.
+        self.least_silence = 0.0
         #: Whether its agent has announced the end of the nodes: silence is no news then.
         self.announced = False
         #: The agent's UDP port for heartbeats, and the address from which they come.

@@ -298,6 +298,10 @@ class RunningMachine(MachineJob):
         """Count a silent machine as lost after this time, even if its provider says it runs."""
         self.longest_silence = seconds
 
+    def bear_silence(self, seconds: float) -> None:
+        """Count a machine as lost only after this time without a word of it and its provider."""
+        self.least_silence = seconds
+
     def end(self, reason: str) -> bool:
         """
         End the machine as its ``on_exit`` says; its further events are ignored.

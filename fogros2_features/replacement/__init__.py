@@ -48,11 +48,11 @@ class Replacement(Feature):
 
         :param on_interrupt: what to do when the provider reclaims the machine while its nodes run,
             or when neither the machine nor its provider has answered for 37 s.
-            'shutdown', the default, ends the launch with a nonzero exit status. 'robot' restarts
-            the nodes on the robot, where their programs must be installed. They keep names and
-            parameters, and lose their memory: lifecycle states and loaded components. 'replace'
-            creates a new machine; until it is up, nodes whose programs are installed on the robot
-            run there.
+            'shutdown', the default, waits for ``robot_timeout`` if that is longer, and ends the
+            launch with a nonzero exit status. 'robot' restarts the nodes on the robot, where their
+            programs must be installed. They keep names and parameters, and lose their memory:
+            lifecycle states and loaded components. 'replace' creates a new machine; until it is
+            up, nodes whose programs are installed on the robot run there.
         :param on_loss_after: silence after which 'replace' replaces the machine, in seconds or
             text such as '5m'; at least ``robot_timeout``, which is the default.
         :param max_replacements: how often 'replace' replaces the machine in a launch; 3.
@@ -104,9 +104,12 @@ class Replacement(Feature):
 
     @contextlib.contextmanager
     def machine(self, running: RunningMachine, own: Options) -> Iterator[None]:
-        """Let the machine count as lost before it is replaced, whatever its provider says."""
+        """Set the silence after which the machine counts as lost."""
         if own.replaces:
             running.lose_after(own.on_loss_after or running.spec.robot_timeout)
+        elif own.on_interrupt == 'shutdown':
+            # as long as its nodes go on there, the launch may wait for the network
+            running.bear_silence(running.spec.robot_timeout)
         yield
 
     def session(self, own: Options) -> functools.partial[Interruptible]:

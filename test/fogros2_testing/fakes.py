@@ -429,3 +429,7 @@ class FakeRunning:
     def lose_after(self, seconds: float) -> None:
         """Collect the call."""
         self.calls.append(('lose_after', seconds))
+
+    def bear_silence(self, seconds: float) -> None:
+        """Collect the call."""
+        self.calls.append(('bear_silence', seconds))

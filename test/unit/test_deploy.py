@@ -8,6 +8,7 @@ import contextlib
 import copy
 import dataclasses
 import hashlib
+import math
 import os
 from pathlib import Path
 import re
@@ -1193,24 +1194,31 @@ def test_machine_without_any_word_is_lost(cut, provider, monkeypatch):
     assert 'it is lost: no answer for ' in events[0]['reason'] and link.asked == ['stop']
 
 
-@pytest.mark.parametrize('own, limit', [({}, 120.0), ({'on_loss_after': 300}, 300.0)])
-def test_a_machine_is_replaced_after_longer_silence(launch, provider, own, limit):
-    """Never before its robot_timeout, so a cut of 30 s replaces nothing."""
+@pytest.mark.parametrize('known, own, limit', [
+    (True, {'on_interrupt': 'replace'}, 120.0), (False, {'on_interrupt': 'robot'}, 37.0),
+    (True, {'on_interrupt': 'replace', 'on_loss_after': 300}, 300.0), (False, {}, 120.0)])
+def test_silence_before_a_loss_depends_on_what_follows(
+        launch, provider, known, own, limit):
+    """A launch that would end, or replace it, waits as long as its nodes may run there."""
     provider.machines['fake-1'] = Machine('fake-1', 'planner', 'fake', MachineState.RUNNING)
+    if not known:
+        provider.failures.update(describe=ProviderError('no network'))
     context, mine = begun(launch)
     mine.record = dataclasses.replace(mine.record, machine_id='fake-1')
     mine.agent, mine.heartbeat = SimpleNamespace(silent_for=60.0), SimpleNamespace(age=limit)
     lost = []
     watch = Watch(context, mine, over=lambda *words: lost.append(words), found=print)
-    running = SimpleNamespace(
-        spec=SPEC, lose_after=lambda limit: setattr(mine, 'longest_silence', limit))
-    with Replacement().machine(running, Replacement.options(on_interrupt='replace', **own)):
+    with Replacement().machine(mine, Replacement.options(**own)):
         pass
     wait_until(lambda: provider.calls.count('describe') > 0, timeout=60, what='a question')
+    if not known:
+        watch._word_at = -math.inf
+    watch._look()
     assert lost == []
     mine.heartbeat.age = limit + 0.1
     wait_until(lambda: lost or None, timeout=60, what='the verdict')
-    assert lost == [('lost', f'it is lost: no answer for {limit:g} s')]
+    assert lost == [('lost', f'it is lost: no answer for {limit:g} s'
+                     + ('' if known else ', and no word of its provider'))]
     watch.close()
 
 

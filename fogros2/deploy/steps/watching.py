@@ -98,8 +98,9 @@ class Watch(Step):
     Report a machine that does not answer, and ask its provider whether the machine is gone.
 
     A machine that exists but is out of reach is not gone. It is lost if neither it nor its
-    provider answers for ``LOSS`` seconds; a computer that FogROS2 does not own has no provider.
-    With the job's ``longest_silence``, it is lost then, whatever its provider reports.
+    provider answers for ``LOSS`` seconds, or the job's ``least_silence`` if that is longer; a
+    computer that FogROS2 does not own has no provider. With the job's ``longest_silence``, it is
+    lost then, whatever its provider reports.
     An unknown exception is a defect of FogROS2 or of a plugin: it ends the watch and is reported
     at once, and ``close`` raises it, so that the nodes continue until then.
 
@@ -157,7 +158,8 @@ class Watch(Step):
         if (limit := self._job.longest_silence) is not None:
             if age > limit:
                 self._end('lost', f'it is lost: no answer for {age:.0f} s')
-        elif min(age, time.monotonic() - self._word_at) > LOSS:
+        elif min(age, time.monotonic() - self._word_at) > max(
+                LOSS, self._job.least_silence):
             self._end('lost', f'it is lost: no answer for {age:.0f} s, and no word of its '
                       'provider')
 
