@@ -439,8 +439,7 @@ class Feature:
         """
         Return programs that run on the machine beside its nodes, from its first node on.
 
-        Each is a NodeSpec without files, folders, shell, passes_signals and features, or an action
-        of launch.
+        Each is a NodeSpec without files, folders, shell and features, or an action of launch.
         """
         return ()
 

@@ -81,7 +81,8 @@ user=$(id -un 2>/dev/null) group=0
 case $(getent group "$(id -g)") in
     "$user":*: | "$user":*:"$user") group=$(id -g) ;;
 esac
-for path in "$1" "$(readlink -m "$1" || echo /)"; do
+real=$(readlink -m "$1" || echo /)
+for path in "$1" "$real"; do
     while :; do
         for owner in $(stat -c %u "$path" 2>/dev/null; stat -Lc %u "$path" 2>/dev/null); do
             [ "$owner" = 0 ] || [ "$owner" = "$(id -u)" ] || refuse 'belongs to another account'

@@ -17,7 +17,7 @@ from fogros2.launch_internals import private
 from fogros2.model import NodeSpec, Text
 
 #: Fields of a NodeSpec that a process action has not.
-_LOST = ('files', 'folders', 'shell', 'passes_signals', 'features')
+_LOST = ('files', 'folders', 'shell', 'features')
 _PACKAGE_PATHS = {'share': FindPackageShare, 'prefix': FindPackagePrefix}
 
 
@@ -53,6 +53,8 @@ class AddedProcess(ExecuteProcess):
             sigkill_timeout=str(spec.sigkill_timeout))
         #: The id of its node.
         self.node = spec.id
+        #: See NodeSpec; launch itself gives no signal to children.
+        self.passes_signals = spec.passes_signals
         if up is not None:
             private.delay_start(self, lambda: asyncio.shield(up))
 

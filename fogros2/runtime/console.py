@@ -120,8 +120,9 @@ class Console:
         self._handler.stream = self._stream  # setStream fails where the former one is closed
         self._lock = threading.RLock()
         self._running: dict[tuple[str, str], _Running] = {}
-        self._drawn = False
-        self._live = redraws(self._stream.stream)
+        self._drawn = self._live = False
+        with contextlib.suppress(ValueError):  # it is closed
+            self._live = redraws(self._stream.stream)
         self._ticks = Periodic('fog-progress', TICK, self._tick)
         if self._live:
             # a log line overwrites the progress line instead of following it

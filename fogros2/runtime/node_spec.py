@@ -189,6 +189,7 @@ def from_action(
             for key, value in added_folders(description.final_env or {}, base).items()},
         cwd=None if description.final_cwd is None else texts.text(description.final_cwd),
         shell=action.shell,
+        passes_signals=getattr(action, 'passes_signals', False),  # of an AddedProcess
         emulate_tty=_emulate_tty(action, context),
         respawn=bool(private.option(action, 'respawn')),
         respawn_delay=private.option(action, 'respawn_delay') or 0.0,

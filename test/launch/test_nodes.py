@@ -420,7 +420,8 @@ def test_home_of_the_robot_in_a_component_is_mentioned(
 def test_program_beside_nodes_starts_as_its_feature_says(run, fake, planner, monkeypatch):
     program = NodeSpec(
         'x', 'beside', 'demo', 'talker', ('a',), prefix=('nice', '-n', 'two words'), cwd='/srv',
-        environment={'A': 'b'}, emulate_tty=True, respawn=True, respawn_max_retries=2)
+        environment={'A': 'b'}, emulate_tty=True, respawn=True, respawn_max_retries=2,
+        passes_signals=True)
 
     class Beside(Feature):
         always = True

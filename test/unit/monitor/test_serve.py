@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 
+from ament_index_python.packages import get_package_prefix
 import pytest
 
 from fogros2.waiting import wait_until
@@ -16,7 +17,7 @@ from rigs.domains import taken
 
 serve = pytest.importorskip(
     'fogros2_monitor.serve', reason='rclpy is not installed')
-BRIDGE = [sys.executable, str(Path(serve.__file__).with_name('scripts') / 'bridge')]
+BRIDGE = [sys.executable, str(Path(get_package_prefix('fogros2'), 'lib/fogros2/bridge'))]
 
 
 @pytest.fixture(autouse=True)
