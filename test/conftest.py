@@ -109,6 +109,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                                  'integration' not in item.path.parts))
 
 
+def forget_process_loggers() -> None:
+    """Let go of the loggers of a test's processes: pytest goes through all, three times a test."""
+    loggers = logging.Logger.manager.loggerDict
+    for name in [name for name in loggers if re.search(r'-\d+(-stdout|-stderr)?$', name)]:
+        del loggers[name]
+
+
 @pytest.fixture(scope='session')
 def own_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Yield one new folder after the other; pytest takes longer for each, as it counts them."""
@@ -135,6 +142,7 @@ def state_home(
     yield path
     if 'launch.logging' in sys.modules:  # its log file is in the folder
         sys.modules['launch.logging'].reset()
+        forget_process_loggers()
     shutil.rmtree(folder, ignore_errors=True)
 
 
