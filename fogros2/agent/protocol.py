@@ -4,6 +4,9 @@ The agent's protocol: JSON objects, one per line.
 
 A request is ``{"id": 1, "command": ..., ...}``. A reply is ``{"id": 1, "ok": true, ...}`` or
 ``{"id": 1, "ok": false, "error", "hint", "kind"}``. Replies and events are in ``fogros2.events``.
+``of`` in a request is the launch that makes it. If another launch has the machine, the agent sends
+``{"error", "kind": "absent"}`` without ``ok``, as if it were not there, and closes the connection;
+the agent that the launch knew has ended.
 
 ``configure``  any key of ``CONFIG``; restarts the lifetime and, with ``heartbeat``, the watchdog.
                With another ``launch`` than before, the former launch's nodes stop first, and

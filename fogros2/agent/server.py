@@ -119,6 +119,11 @@ class Client:
             self.reply(number, answer)
         return reply
 
+    def turn_away(self, reason: str) -> None:
+        """Tell a launch that its agent isn't here any more, and close the connection."""
+        self.ended, self.position = True, None
+        self.send(dump({'error': reason, 'kind': 'absent'}))
+
     def send(self, data: bytes = b'') -> None:
         """Send data, then events, as far as the other end takes them now, the rest later."""
         if self not in self.agent.clients:
@@ -431,6 +436,11 @@ class Agent:
             handler = getattr(self, f'do_{command}', None)
             if handler is None:
                 raise Refused(f'no such command: {json.dumps(command)[:80]}', kind='unknown')
+            if command not in ('configure', 'release'):  # they compare it for themselves
+                launch, owner = request.get('of'), self.config['launch']
+                if launch and owner and launch != owner:
+                    client.turn_away(f"launch '{owner}' has this machine now")
+                    return
             answer = handler(client, request)
         except Refused as error:
             answer = error.answer
@@ -545,6 +555,7 @@ class Agent:
             raise Refused("'nodes' is a list of objects")
         nodes = [Node(spec) for spec in specs]
         self._check_held()
+        owner = self.config['launch']
         reply = client.reply_later(request.get('id'))
 
         def sourced(failure: Optional[Refused]) -> None:
@@ -552,6 +563,8 @@ class Agent:
                 if failure is not None:
                     raise failure
                 self._check_held()
+                if owner != self.config['launch']:
+                    raise Refused('another launch has taken this machine over', kind='released')
                 if self.config['heartbeat'] and self.watchdog.beat_at is None:
                     # the robot was gone, and the machine stayed
                     self.watchdog.beat_at = self.loop.clock()

@@ -58,10 +58,6 @@ class _Pending:
         self.reply: dict[str, Any] = {}
 
 
-#: A request without a waiting caller; its reply shows that the agent is there.
-_PING = _Pending(0, 'ping')
-
-
 class AgentClient:
     """
     A connection to a machine's agent that reconnects after a loss.
@@ -93,6 +89,8 @@ class AgentClient:
         self._sending = 0.0
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
+        #: The launch that has configured the agent with this client, as all requests then say.
+        self._of: dict[str, str] = {}
         self._stream: Optional[Stream] = None
         self._error: Optional[AgentError] = None
         #: Whether an agent has answered, and whether the connection to it is lost.
@@ -156,7 +154,7 @@ class AgentClient:
             raise RuntimeError('a subscriber must not make requests')
         self.connect()
         number = next(self._numbers)
-        pending = _Pending(number, command, **arguments)
+        pending = _Pending(number, command, **self._of, **arguments)
         with self._lock:
             if self._error is not None:
                 raise self._error
@@ -186,6 +184,8 @@ class AgentClient:
             raise self._error
         if not reply.get('ok'):
             raise AgentError(str(reply.get('error', 'refused')), str(reply.get('hint', '')))
+        if command == 'configure' and 'launch' in arguments:
+            self._of = {'of': arguments['launch']}
         return reply
 
     def status(self, *, timeout: float = 30.0) -> events.Status:
@@ -341,7 +341,12 @@ class AgentClient:
 
     def _follow_on(self, stream: Stream) -> None:
         self._log_request = next(self._numbers)
-        self._lines.put((stream, _Pending(self._log_request, 'log', **{'from': self._next})))
+        self._lines.put((stream, _Pending(
+            self._log_request, 'log', **self._of, **{'from': self._next})))
+
+    def _ping(self, stream: Stream) -> None:
+        """Send a request without a waiting caller; its reply shows that the agent is there."""
+        self._lines.put((stream, _Pending(0, 'ping', **self._of)))
 
     def _write_all(self) -> None:
         while (item := self._lines.get()) is not None:
@@ -372,7 +377,7 @@ class AgentClient:
         if silent > SILENCE:
             stream.close()
         elif self._lines.empty():  # else the connection takes nothing
-            self._lines.put((stream, _PING))
+            self._ping(stream)
 
     def _reopen(self) -> None:
         """Reconnect, with increasing pauses, until the client is closed, or refused for long."""
@@ -415,7 +420,8 @@ class AgentClient:
                     pending.done.set()
         if self._next is not None:
             self._follow_on(stream)
-        for pending in (_PING, *again):
+        self._ping(stream)
+        for pending in again:
             self._lines.put((stream, pending))
 
 

@@ -682,6 +682,27 @@ def test_machine_with_heartbeats_is_not_taken_over(rig, heartbeat):
     wait_until(lambda: 'mine' in rig.text('n'), timeout=60, what='the new node')
 
 
+@pytest.mark.parametrize('command, arguments', [
+    ('stop', {'nodes': None}), ('signal', {'node': 'n', 'signal': 'SIGKILL'}),
+    ('start', {'nodes': [NodeSpec('late', 'late-1', arguments=('true',))]}),
+    ('watch', {'what': 'vpn', 'argv': ['true']}), ('ping', {}), ('status', {})])
+def test_a_launch_that_lost_the_computer_rules_no_nodes_there(
+    rig, command, arguments, monkeypatch,
+):
+    """Its robot was out of reach while its agent ended and another launch came."""
+    monkeypatch.setattr(connection, 'RESTART', 0.2)
+    late = rig.started()
+    late.request('configure', launch='abc123', again=True)
+    rig.client().request('configure', launch='def456', force='abc123')
+    rig.run(rig.node('n', SLEEP))
+    # a signal is not sent again over the next connection
+    with pytest.raises(AgentError, match="launch 'def456' has this machine now|lost meanwhile"):
+        late.request(command, **arguments)
+    rig.wait('connection', state='absent')
+    assert states(rig.clients[-1]) == {'n': 'running'}
+    assert rig.ask('status')['kept'] == []
+
+
 def test_release_stops_the_nodes_before_it_answers(rig):
     client = rig.started(on_exit='delete')
     rig.run(rig.node('n', (
