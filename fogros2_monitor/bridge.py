@@ -4,7 +4,7 @@ Serve a machine's topics, services and parameters to Foxglove, and publish viewe
 
 The node subscribes to a topic only while a viewer shows it, and forwards messages without
 decoding them. A slow viewer loses its oldest messages, without effect on other viewers. An H.264
-stream of ``image_transport_h264`` is sent as ``foxglove.CompressedVideo``.
+stream of ``image_transport_h264`` is sent as ``foxglove_msgs/CompressedVideo``.
 
 Parameters: ``address``, ``port`` (0: any free port; the log has the port), ``topics`` (patterns of
 the names of topics, services and parameters to show), ``client_publish`` (whether viewers may
@@ -30,6 +30,7 @@ import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from fogros2 import ros_types
 from fogros2.ros_names import absolute
@@ -212,7 +213,9 @@ class BridgeNode(GraphNode, ServerListener):
             self.refuse(f'{topic}: not among the topics of this bridge')
             return
         try:
-            self._published[key] = self.create_publisher(ros_types.message(kind), topic, 10)
+            # every subscriber takes it, those of latched topics, too
+            qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self._published[key] = self.create_publisher(ros_types.message(kind), topic, qos)
         except (LookupError, NameValidationException) as error:
             self.refuse(f'{topic}: {error}')
 

@@ -14,6 +14,10 @@ from typing import Any
 from fogros2 import ros_types
 
 _RULE = '=' * 80
+#: Name and definition of what shows an H.264 stream to viewers, which few computers have.
+VIDEO = ('foxglove_msgs/msg/CompressedVideo', (
+    'builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n'
+    f'{_RULE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n'))
 #: Types of IDL in message classes, and the same types in message files.
 _BASIC = {
     'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64',

@@ -61,7 +61,9 @@ class RecorderNode(GraphNode):
     def _chosen(self, everything: Iterable[str]) -> dict[str, str]:
         # of a denied topic, or a stream between machines, the graph has only the new name
         names = {name: self.resolve_topic_name(name) for name in self._names}
-        return {name: full for name, full in names.items() if full in everything}
+        # the file says of each topic what its publishers offer, so it takes one to begin
+        return {name: full for name, full in names.items() if full in everything
+                and (name in self._topics or self.count_publishers(full))}
 
     def _report_missing(self) -> None:
         self._missing.cancel()

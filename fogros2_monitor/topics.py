@@ -2,17 +2,18 @@
 """
 Pass messages of the ROS graph on to viewers or a file, without decoding them.
 
-An H.264 stream of ``image_transport_h264`` is passed on as ``foxglove.CompressedVideo``.
+An H.264 stream of ``image_transport_h264`` is passed on as ``foxglove_msgs/CompressedVideo``, as
+rosbag2 opens no file whose topics are serialized in different ways.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 import fnmatch
+import json
 from typing import Any, Optional
 
 import foxglove
-from foxglove.messages import CompressedVideo, Timestamp
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -20,8 +21,8 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Empty
 
 from fogros2 import ros_types
-from fogros2_monitor.definitions import definition
-from image_transport_h264.cdr import CdrError
+from fogros2_monitor.definitions import definition, VIDEO
+from image_transport_h264.cdr import CdrError, Writer
 from image_transport_h264.message import coded
 
 #: Poll interval of the topics in the graph, in seconds.
@@ -41,11 +42,11 @@ class Topic:
         self._node = node
         self._name = name
         self._class = ros_types.message(kind)
-        schema = CompressedVideo.get_schema() if video else foxglove.Schema(
-            name=kind, encoding='ros2msg', data=definition(kind).encode())
+        shown, text = VIDEO if video else (kind, definition(kind))
         self._channel = foxglove.Channel(
-            name, schema=schema, message_encoding='protobuf' if video else 'cdr',
-            context=node.viewers)
+            name, schema=foxglove.Schema(name=shown, encoding='ros2msg', data=text.encode()),
+            message_encoding='cdr', context=node.viewers,
+            metadata={'offered_qos_profiles': offered(node, name)})
         self._subscription: Optional[Subscription] = None
         self._fits: tuple[Any, Any] = (None, None)
         self._requests: Optional[Publisher] = None
@@ -108,9 +109,7 @@ class Topic:
         except CdrError as error:
             self._node.get_logger().warning(f'{self._name}: {error}', once=True)
             return
-        self._channel.log(CompressedVideo(
-            timestamp=Timestamp(header.sec, header.nanosec), frame_id=header.frame_id,
-            data=bytes(data), format=form).encode())
+        self._channel.log(Writer().header(header).octets(data).string(form).data())
 
 
 class GraphNode(Node):
@@ -175,3 +174,16 @@ def fitting(node: Node, topic: str) -> QoSProfile:
         history=HistoryPolicy.KEEP_LAST, depth=max(10, min(depth, 1000)),
         reliability=(ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
         durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
+
+
+def offered(node: Node, topic: str) -> str:
+    """Return the QoS profiles of a topic's publishers, as rosbag2 writes and reads them: YAML."""
+    def profile(qos: QoSProfile) -> dict[str, Any]:
+        times = {name: dict(zip(('sec', 'nsec'), divmod(getattr(qos, name).nanoseconds, 10 ** 9)))
+                 for name in ('deadline', 'lifespan', 'liveliness_lease_duration')}
+        policies = {name: getattr(qos, name).short_key
+                    for name in ('history', 'reliability', 'durability', 'liveliness')}
+        return {**policies, 'depth': qos.depth, **times, 'avoid_ros_namespace_conventions': False}
+
+    return json.dumps([profile(info.qos_profile)
+                       for info in node.get_publishers_info_by_topic(topic)])

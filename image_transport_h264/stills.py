@@ -129,8 +129,11 @@ def bgr(picture: Picture) -> Pixels:
     Return a checked picture as an array of OpenCV's: grey, BGR or BGRA.
 
     :param picture: of another encoding than '32FC1', which OpenCV does not have.
+    :raises BadPicture: a width that OpenCV does not have in this encoding.
     """
     layout = picture.layout
+    if layout.kind == 'yuv422' and picture.width % 2:
+        raise BadPicture(f"{picture.encoding} of an odd width: use the transport 'h264'", 'size')
     rows = numpy.ascontiguousarray(picture.rows())
     if layout.kind == 'deep':
         values = rows.view('>u2' if picture.is_bigendian else '<u2')

@@ -35,6 +35,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CompressedImage, Image, Imu
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 from std_srvs.srv import SetBool, Trigger
+import yaml
 
 from fogros2.errors import DeadlineExceeded
 from fogros2.waiting import wait_until
@@ -353,22 +354,6 @@ def test_many_viewers_do_not_slow_down_the_robot(bench, viewers, seconds, tmp_pa
     assert min(got[1:]) > 0.5 * seconds * RATE
 
 
-def protobuf(data: bytes) -> dict[int, bytes]:
-    """Return the fields of a message that has only such with a length."""
-    fields = {}
-    while data:
-        number, data = data[0] >> 3, data[1:]
-        length = shift = 0
-        while True:
-            byte, data = data[0], data[1:]
-            length |= (byte & 0x7f) << shift
-            shift += 7
-            if byte < 0x80:
-                break
-        fields[number], data = data[:length], data[length:]
-    return fields
-
-
 def publish_images(bench: Bench) -> None:
     """Publish images 30 times a second, and their stream as ``/camera/h264``."""
     images = bench.node.create_publisher(Image, '/camera', 2)
@@ -544,7 +529,7 @@ def test_viewer_publishes_only_topics_of_the_bridge(bench):
         assert 'not among the topics' in viewer.until('status')['status']
         assert not bench.node.count_publishers(topic)
     heard: list[Any] = []
-    bench.node.create_subscription(String, '/words', heard.append, 10)
+    bench.node.create_subscription(String, '/words', heard.append, LATCHED)
 
     def publish() -> bool:
         viewer.wish(publish='words', schemaName='std_msgs/msg/String', definition='string data',
@@ -580,14 +565,29 @@ def recorded(folder: Path) -> dict[str, list[Any]]:
     messages: dict[str, list[Any]] = {}
     with path.open('rb') as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for schema, channel, message in reader.iter_messages():
-            assert schema is not None
-            if schema.name == 'foxglove.CompressedVideo':
-                messages.setdefault(channel.topic, []).append(protobuf(message.data))
-        for _, channel, _, decoded in reader.iter_decoded_messages(
-                topics=['/said', '/plan', '/later']):
+        for _, channel, _, decoded in reader.iter_decoded_messages():
+            # rosbag2 opens only files that have one serialization
+            assert channel.message_encoding == 'cdr'
             messages.setdefault(channel.topic, []).append(decoded.data)
     return messages
+
+
+def durabilities(folder: Path) -> dict[str, list[str]]:
+    """Return what the publishers of each topic offered, as rosbag2 reads it."""
+    path, = folder.glob('*.mcap')
+    with path.open('rb') as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        profiles = {channel.topic: yaml.safe_load(channel.metadata['offered_qos_profiles'])
+                    for channel in summary.channels.values()}
+    for each in profiles.values():
+        for profile in each:
+            assert {*profile} == {
+                'history', 'depth', 'reliability', 'durability', 'deadline', 'lifespan',
+                'liveliness', 'liveliness_lease_duration', 'avoid_ros_namespace_conventions'}
+            assert {*profile['lifespan']} == {'sec', 'nsec'}
+    return {topic: [profile['durability'] for profile in each]
+            for topic, each in profiles.items()}
 
 
 def test_recording_and_viewer_have_streams_as_they_came(bench, tmp_path):
@@ -616,14 +616,14 @@ def test_recording_and_viewer_have_streams_as_they_came(bench, tmp_path):
     bench.until(lambda: len(pictures) > 60 and len(sent) > 50, 'images and words')
     # a viewer comes in the midst of a stream, and needs a picture that stands alone
     viewer = bench.viewer()
-    viewer.until('schema', 'foxglove.CompressedVideo')
+    viewer.until('schema', 'foxglove_msgs/msg/CompressedVideo')
     viewer.wish(subscribe='/camera/h264')
     decoder, frames = av.CodecContext.create('h264', 'r'), []
     while not frames:
-        fields = protobuf(base64.b64decode(viewer.message('/camera/h264')))
-        assert (fields[2], fields[4]) == (b'camera_link', b'h264')
+        shown = viewer.message('/camera/h264')
+        assert (shown['frame_id'], shown['format']) == ('camera_link', 'h264')
         with contextlib.suppress(av.error.InvalidDataError):  # one before the picture
-            frames += decoder.decode(av.Packet(fields[3]))
+            frames += decoder.decode(av.Packet(bytes(shown['data'])))
     assert (frames[0].width, frames[0].height) == (64, 48)
     recorder.send_signal(signal.SIGINT)
     assert recorder.wait(60) == 0
@@ -635,10 +635,13 @@ def test_recording_and_viewer_have_streams_as_they_came(bench, tmp_path):
     assert len(numbers) > 20 and numbers == sorted({*numbers})
     decoder = av.CodecContext.create('h264', 'r')
     frames: list[Any] = []
-    for fields in got['/camera/h264']:
+    for data in got['/camera/h264']:
         with contextlib.suppress(av.error.InvalidDataError):  # one before the picture
-            frames += decoder.decode(av.Packet(fields[3]))
+            frames += decoder.decode(av.Packet(bytes(data)))
     assert (frames[0].width, frames[0].height) == (64, 48)
+    assert durabilities(tmp_path / 'new') == {
+        '/plan': ['transient_local'], '/later': ['transient_local'], '/said': ['volatile'],
+        '/camera/h264': ['volatile']}
 
 
 def test_renamed_topic_is_recorded_and_missing_one_is_named(bench, tmp_path):

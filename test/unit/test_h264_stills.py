@@ -64,6 +64,8 @@ def test_yuv_comes_back_as_colours(encoding: str) -> None:
     ('16UC1', 'jpeg', "JPEG can't hold 16UC1.* 'h264'.*or 'compressed' with format='png'"),
     ('32FC1', 'jpeg', "JPEG can't hold 32FC1: use the transport 'h264'.* for it$"),
     ('32FC1', 'png', "PNG can't hold 32FC1: use the transport 'h264'.* for it$"),
+    ('yuv422', 'jpeg', "yuv422 of an odd width: use the transport 'h264'$"),
+    ('uyvy', 'png', "uyvy of an odd width: use the transport 'h264'$"),
     ('bayer_rggb8', 'jpeg', "'bayer_rggb8' isn't one of .* the transport 'raw', which carries"),
     ('rgb16', 'png', "'rgb16' isn't one of .* the transport 'raw', which carries")])
 def test_refused_picture_names_what_carries_it(
