@@ -59,7 +59,11 @@ def main() -> None:
             for writer in writers:
                 writer.write(String(f'{count} {time.monotonic()!r} {padding}'))
             count += 1
-        waitset.wait(duration(seconds=max(0.001, min(0.2, due - time.monotonic()))))
+        pause = max(0.001, min(0.2, due - time.monotonic()))
+        if readers:
+            waitset.wait(duration(seconds=pause))
+        else:  # a wait set without a condition returns at once
+            time.sleep(pause)
         for name, reader in readers:
             for sample in reader.take(N=100):
                 if not isinstance(sample, String):
