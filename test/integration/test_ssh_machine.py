@@ -13,6 +13,7 @@ import uuid
 
 import pytest
 
+from fogros2 import store
 from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
 from rigs.bare_computer import bare_computer
@@ -39,22 +40,13 @@ def computer(cloud_network, tmp_path_factory):
         yield running
 
 
-@pytest.fixture(scope='module')
-def cache(tmp_path_factory):
-    """Return where the wheels are, so that they are packed by these tests and for them."""
-    path = tmp_path_factory.mktemp('cache')
-    yield path
-    shutil.rmtree(path, ignore_errors=True)
-
-
 @pytest.fixture(autouse=True)
-def home(cache, tmp_path, monkeypatch):
-    """Give the robot a home of its own: no known hosts, no keys."""
-    monkeypatch.setenv('XDG_CACHE_HOME', str(cache))
+def home(tmp_path, monkeypatch):
+    """Give the robot a home of its own, without known hosts and keys; its wheels are packed."""
+    monkeypatch.setenv('XDG_CACHE_HOME', str(store.cache_home().parent))
     monkeypatch.setenv('HOME', str(tmp_path))
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     monkeypatch.delenv('SSH_AUTH_SOCK', raising=False)
-    return tmp_path
 
 
 @pytest.fixture
