@@ -10,16 +10,14 @@ import uuid
 
 import pytest
 
-from fogros2.host import wheels
 from fogros2.model import Command
 from fogros2.process import run
 from fogros2.provider.container.entry import AGENT_DIRECTORY
 from fogros2.waiting import wait_until
-from rigs.bare_computer import bare_computer
 from rigs.launched import Launched, launching, ros2
-from rigs.second_robot import second, SecondRobot
+from rigs.second_robot import join, second, SecondRobot
 
-__all__ = ['second']
+__all__ = ['join', 'second']
 
 FIRST = """
 from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
@@ -33,23 +31,6 @@ def generate_launch_description():
                   remappings=[('chatter', '/far')]),
         CloudNode(machine=machine, package='fogros2_examples', executable='listener',
                   output='screen', remappings=[('chatter', '/near')])])
-"""
-SECOND = """
-from launch_ros.actions import Node
-
-from fogros2 import CloudNode, FogROSLaunchDescription, JoinedMachine
-
-
-def generate_launch_description():
-    machine = JoinedMachine('{text}', name='theirs', ros_workspace='{workspace}',
-                            robot_timeout=10)
-    return FogROSLaunchDescription([
-        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
-                  output='screen', remappings=[('chatter', '/near')]),
-        *[CloudNode(machine=machine, package='own', executable='where', output='screen')]
-        * bool('{workspace}'),
-        Node(package='fogros2_examples', executable='listener', output='screen',
-             remappings=[('chatter', '/near')])])
 """
 
 
@@ -103,19 +84,6 @@ def first(
             return First(name, started, engine)
         yield launch
     ros2('fog', 'delete', '--yes', name)
-
-
-@pytest.fixture
-def join(
-    second: SecondRobot, tmp_path: Path,
-) -> Iterator[Callable[..., Launched]]:
-    with launching() as start:
-        def launch(text: str, workspace: str = '') -> Launched:
-            path = tmp_path / 'second.launch.py'
-            path.write_text(SECOND.format(text=text, workspace=workspace))
-            return start(str(path), environment=second.environment,
-                         prefix=second.enter)
-        yield launch
 
 
 @pytest.fixture
@@ -213,52 +181,3 @@ def guest_stays_until_the_next_launch(
     again = first('delete')
     assert again.accounts() == [] and again.talkers() == 0
     assert again.there('ls /sys/class/net').count('fog') == 1
-
-
-SSH = """
-from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
-
-
-def generate_launch_description():
-    machine = SSHInstance(
-        '{host.address}', '{host.user}', key='{host.key}', host_key='{host.host_key}',
-        name='{host.name}', ros_workspace='', bootstrap='pip', on_exit='keep')
-    return FogROSLaunchDescription([
-        CloudNode(machine=machine, package='fogros2_examples', executable='listener',
-                  output='screen', remappings=[('chatter', '/near')])])
-"""
-
-
-def test_guest_of_an_ssh_host_gets_what_its_nodes_need(
-    second: SecondRobot, join: Callable[..., Launched], tmp_path: Path, cloud_network: str,
-    engine: str, nothing_left: None,
-) -> None:
-    if not wheels.collect(tmp_path / 'wheels').ros:
-        pytest.skip('this robot has an installation of ROS 2 and no wheels to send')
-    name = f'ssh-{uuid.uuid4().hex[:6]}'
-    path = tmp_path / 'ssh.launch.py'
-    with bare_computer(name, tmp_path / 'computer', cloud_network) as computer, \
-            launching() as start:
-        path.write_text(SSH.format(host=computer))
-        launched = start(str(path))
-        launched.wait_for('process started', timeout=300.0)
-        gateway = second.reaches(engine, cloud_network)
-        computer.run(f'ip route add {second.nat_address} via {gateway}')
-        key = second.run('ros2', 'fog', 'key').strip()
-        done = ros2('fog', 'invite', name, '--key', key)
-        assert done.returncode == 0, done.stderr
-        joined = join(done.stdout.strip())
-        joined.wait_for('I heard', timeout=300.0)
-        launched.interrupt()
-        assert launched.ended() == 0, launched.text
-        joined.wait_for('I heard', times=joined.text.count('I heard') + 5)
-        joined.interrupt()
-        assert joined.ended() == 0, joined.text
-        assert 'talker' not in ' '.join(computer.leftovers())
-        assert ros2('fog', 'revoke', name).returncode == 0
-        wait_until(lambda: not computer.run(
-            'ls -d /sys/class/net/fog* /run/fog* /var/lib/fogros2-guests || :').stdout,
-            timeout=60.0, what='the guest and the VPN to be gone')
-        assert computer.run('grep -c ^fog.*g2 /etc/passwd || :').stdout == '0\n'
-        deleted = ros2('fog', 'delete', '--yes', name)
-        assert deleted.returncode == 0, deleted.stderr

@@ -19,6 +19,9 @@ from fogros2.waiting import wait_until
 from rigs.bare_computer import bare_computer
 from rigs.colcon_workspace import colcon_workspace
 from rigs.launched import embedded, launching, ros2
+from rigs.second_robot import join, second
+
+__all__ = ['join', 'second']
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -242,3 +245,46 @@ def test_an_unsourced_workspace_of_linked_packages_runs(computer, launch, tmp_pa
     assert run.ended() == 0, run.text
     assert 'speed is 42' in run.text
     assert 'WARNING' not in run.text and run.errors == [], run.text
+
+
+KEPT = """
+from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
+
+
+def generate_launch_description():
+    machine = SSHInstance(
+        '{host.address}', '{host.user}', key='{host.key}', host_key='{host.host_key}',
+        name='{host.name}', ros_workspace='', bootstrap='pip', on_exit='keep')
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='listener',
+                  output='screen', remappings=[('chatter', '/near')])])
+"""
+
+
+@pytest.mark.skipif(not embedded(), reason='this robot has no wheels of ROS 2 to send')
+def test_guest_gets_what_its_nodes_need(
+        computer, launch, cloud_network, engine, second, join, tmp_path):
+    path = tmp_path / 'kept.launch.py'
+    path.write_text(KEPT.format(host=computer))
+    launched = launch(str(path))
+    launched.wait_for('process started')
+    gateway = second.reaches(engine, cloud_network)
+    computer.run(f'ip route replace {second.nat_address} via {gateway}')
+    key = second.run('ros2', 'fog', 'key').strip()
+    done = ros2('fog', 'invite', computer.name, '--key', key)
+    assert done.returncode == 0, done.stderr
+    joined = join(done.stdout.strip())
+    joined.wait_for('I heard', timeout=300.0)
+    launched.interrupt()
+    assert launched.ended() == 0, launched.text
+    joined.wait_for('I heard', times=joined.text.count('I heard') + 5)
+    joined.interrupt()
+    assert joined.ended() == 0, joined.text
+    assert 'talker' not in ' '.join(computer.leftovers())
+    assert ros2('fog', 'revoke', computer.name).returncode == 0
+    wait_until(lambda: not computer.run(
+        'ls -d /sys/class/net/fog* /run/fog* /var/lib/fogros2-guests || :').stdout,
+        timeout=60.0, what='the guest and the VPN to be gone')
+    assert computer.run('grep -c ^fog.*g2 /etc/passwd || :').stdout == '0\n'
+    deleted = ros2('fog', 'delete', '--yes', computer.name)
+    assert deleted.returncode == 0, deleted.stderr

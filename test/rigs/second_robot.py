@@ -11,7 +11,7 @@ Each has four addresses of its own, so that several tests run beside one another
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import json
 import os
 from pathlib import Path
@@ -23,6 +23,7 @@ from fogros2.model import Command
 from fogros2.process import argv, run
 from fogros2.store import Store
 from rigs import domains
+from rigs.launched import Launched, launching
 
 #: How many there are at a time: 203.0.113.192/26 has so many networks of four addresses.
 ROBOTS = 16
@@ -35,6 +36,24 @@ table inet nat {
     }
     chain postrouting { type nat hook postrouting priority srcnat; oifname "out" masquerade; }
 }
+"""
+#: A launch file of its own, with a talker on a machine by an invitation.
+LAUNCH = """
+from launch_ros.actions import Node
+
+from fogros2 import CloudNode, FogROSLaunchDescription, JoinedMachine
+
+
+def generate_launch_description():
+    machine = JoinedMachine('{text}', name='theirs', ros_workspace='{workspace}',
+                            robot_timeout=10)
+    return FogROSLaunchDescription([
+        CloudNode(machine=machine, package='fogros2_examples', executable='talker',
+                  output='screen', remappings=[('chatter', '/near')]),
+        *[CloudNode(machine=machine, package='own', executable='where', output='screen')]
+        * bool('{workspace}'),
+        Node(package='fogros2_examples', executable='listener', output='screen',
+             remappings=[('chatter', '/near')])])
 """
 
 
@@ -131,3 +150,14 @@ def second(tmp_path: Path, tun: None) -> Iterator[SecondRobot]:
             yield robot
         finally:
             robot.close()
+
+
+@pytest.fixture
+def join(second: SecondRobot, tmp_path: Path) -> Iterator[Callable[..., Launched]]:
+    """Return what launches on the second robot with an invitation and a workspace's folder."""
+    with launching() as start:
+        def launch(text: str, workspace: str = '') -> Launched:
+            path = tmp_path / 'second.launch.py'
+            path.write_text(LAUNCH.format(text=text, workspace=workspace))
+            return start(str(path), environment=second.environment, prefix=second.enter)
+        yield launch
