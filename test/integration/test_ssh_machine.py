@@ -36,10 +36,14 @@ COLCON = shutil.which('colcon', path=os.pathsep.join(
 
 @pytest.fixture(scope='module')
 def computer(cloud_network, tmp_path_factory):
-    """Run a computer with Python alone; where the robot has ROS 2, it has that as well."""
+    """
+    Run a computer with Python alone; where the robot has ROS 2, it has that as well.
+
+    It may mount, as any computer that is not a container does.
+    """
     mounts = [] if embedded() else container_root.environment_mounts(None)
     with bare_computer(f'fogt-ssh-{RUN}', tmp_path_factory.mktemp('computer'), cloud_network,
-                       mounts=mounts) as running:
+                       mounts=mounts, options=('--cap-add', 'SYS_ADMIN')) as running:
         yield running
 
 
@@ -74,34 +78,85 @@ def test_bare_computer_gets_missing_packages(computer, launch):
     assert computer.leftovers() == []
 
 
-def test_agent_that_died_repairs_and_removes_the_vpn(computer, launch, tmp_path):
-    name = f'dies-{RUN}'
-    path = tmp_path / 'dies.launch.py'
-    path.write_text(textwrap.dedent(f"""
-        from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
+#: robot_timeout is more than a repair takes.
+VOLUME = """
+from fogros2 import CloudNode, FogROSLaunchDescription, SSHInstance
 
 
-        def generate_launch_description():
-            machine = SSHInstance(
-                '{computer.address}', '{computer.user}', key='{computer.key}',
-                host_key='{computer.host_key}', name='{name}', robot_timeout=10)
-            return FogROSLaunchDescription([CloudNode(
-                machine=machine, package='fogros2_examples', executable='talker', respawn=True,
-                output='screen')])
-        """))
-    run = launch(str(path))
-    run.wait_for('Publishing')
+def generate_launch_description():
+    machine = SSHInstance('lab', name='{name}', ros_workspace='', bootstrap='pip',
+                          robot_timeout=10, volumes={{'models': '/data'}})
+    return FogROSLaunchDescription([CloudNode(
+        machine=machine, package='fogros2_examples', executable='talker', respawn=True,
+        output='screen')])
+"""
+
+
+def no_data(computer):
+    return computer.run('[ ! -e /data ]', check=False).returncode == 0
+
+
+def volume_is_mounted_and_in_use(computer):
+    assert computer.run('stat -c %U /data; echo kept >/data/model').stdout == 'fog\n'
+    refused = ros2('fog', 'volume', 'delete', 'models', '--host', 'lab', '--yes')
+    assert refused.returncode == 1 and 'a launch uses the volume' in refused.stderr
+
+
+def agent_that_died_repairs_the_vpn(computer, run, name):
+    running = ' '.join(computer.leftovers())
+    assert 'agent.py' in running and 'talker' in running and name in running
     computer.run(f'kill -9 $(cat /run/fogros2/{name}/agent.pid)')
     run.wait_for('its agent died and was started again')
     run.said.clear()
     run.wait_for('Publishing')
     computer.run('ip link set $(ls /sys/class/net | grep ^fog) down')
     run.wait_for('the VPN was down for')
-    run.kill()
-    # the agent misses the heartbeats
-    wait_until(lambda: computer.leftovers() == [], timeout=60, what='the end of the VPN there')
+
+
+def agent_removes_all_but_the_volume(computer):
+    # it misses the heartbeats
+    wait_until(lambda: computer.leftovers() == [] and no_data(computer), timeout=60,
+               what='the end of the nodes, the VPN and /data there')
     assert 'table inet fog' not in computer.run('nft list tables').stdout
+
+
+def volume_comes_back(computer, again):
+    again.wait_for('Publishing')
+    assert computer.run('cat /data/model').stdout == 'kept\n'
+    again.interrupt()
+    assert again.ended() == 0, again.text
+    wait_until(lambda: no_data(computer), timeout=10.0, what='/data to go')
+
+
+def volume_is_listed_and_deleted(computer):
+    assert 'models' in ros2('fog', 'volume', 'list', '--host', 'lab').stdout
+    assert ros2('fog', 'volume', 'delete', '--host', 'lab', 'models', '--yes').returncode == 0
+    assert computer.run(f'ls /home/{computer.user}/.local/share/fogros2-volumes').stdout == ''
+
+
+def test_killed_launch_leaves_its_volume_alone(computer, launch, tmp_path):
+    """Its agent has died before; ~/.ssh/config says how to reach the computer."""
+    config = tmp_path / '.ssh/config'
+    config.parent.mkdir(mode=0o700)
+    known = config.with_name('known_hosts')
+    known.write_text(f'{computer.address} {computer.host_key}\n')
+    config.write_text(f'Host lab\nHostName {computer.address}\nUser {computer.user}\n'
+                      f'IdentityFile {computer.key}\nUserKnownHostsFile {known}\n')
+    names = [f'{word}-{RUN}' for word in ('dies', 'again')]
+    first, second = (tmp_path / f'{name}.launch.py' for name in names)
+    for path, name in zip((first, second), names):
+        path.write_text(VOLUME.format(name=name))
+    run = launch(str(first))
+    run.wait_for('Publishing')
+    volume_is_mounted_and_in_use(computer)
+    agent_that_died_repairs_the_vpn(computer, run, names[0])
+    run.kill()
+    agent_removes_all_but_the_volume(computer)
+    volume_comes_back(computer, launch(str(second)))
+    assert ros2('fog', 'delete', names[0], '--yes').returncode == 0
     assert ros2('fog', 'gc').returncode == 0
+    assert computer.leftovers() == []
+    volume_is_listed_and_deleted(computer)
 
 
 NODE = """\

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Volumes that outlive container machines and stay on SSH hosts."""
+"""Volumes that outlive container machines, and what mounts a volume."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ import pytest
 from fogros2 import process
 from fogros2.model import Command
 from fogros2.provider.container import engine as container_engine
-from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
 from fogros2_features import volumes
-from rigs.bare_computer import bare_computer, BareComputer
-from rigs.launched import embedded, launching, ros2
+from rigs.launched import launching, ros2
 
 pytestmark = [pytest.mark.usefixtures('nothing_left', 'engine')]
 
 LAUNCH = """
-from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription, SSHInstance
+from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 
 
 def generate_launch_description():
-    machine = {machine}, name='{name}', ros_workspace='', robot_timeout=6,
+    machine = ContainerInstance(
+        network='{network}', name='{name}', ros_workspace='', robot_timeout=6,
         volumes={{'{volume}': '/data'}})
     return FogROSLaunchDescription([CloudNode(
         machine=machine, package='fogros2_examples', executable='talker', output='screen')])
@@ -45,25 +44,24 @@ def inside(container: str, script: str) -> str:
         'exec', container, 'sh', '-ec', script, what='look', check=False).stdout.strip()
 
 
-def launch_file(folder: Path, machine: str, name: str, volume: str) -> str:
+def launch_file(folder: Path, network: str, name: str, volume: str) -> str:
     path = folder / f'{name}.launch.py'
-    path.write_text(LAUNCH.format(machine=machine, name=name, volume=volume))
+    path.write_text(LAUNCH.format(network=network, name=name, volume=volume))
     return str(path)
 
 
 def test_volume_comes_back_with_the_next_container(
     tmp_path: Path, cloud_network: str, volume: str,
 ) -> None:
-    machine = f"ContainerInstance(network='{cloud_network}'"
     first, second = (f'{name}-{uuid.uuid4().hex[:6]}' for name in ('one', 'two'))
     with launching() as start:
-        run = start(launch_file(tmp_path, machine, first, volume))
+        run = start(launch_file(tmp_path, cloud_network, first, volume))
         run.wait_for('Publishing')
         assert f'{volume} at /data' in run.text
         owner = inside(f'fogros2-{first}', 'stat -c %U /data; echo kept >/data/model')
         assert owner == 'fog'
 
-        other = start(launch_file(tmp_path, machine, second, volume))
+        other = start(launch_file(tmp_path, cloud_network, second, volume))
         assert other.ended() != 0
         assert f"the machine '{first}' has the volume '{volume}'" in other.text
         listed = ros2('fog', 'volume', 'list')
@@ -74,7 +72,7 @@ def test_volume_comes_back_with_the_next_container(
         run.kill()  # the agent ends the machine
         wait_until(lambda: inside(f'fogros2-{first}', 'echo runs') != 'runs', timeout=60.0,
                    what='the machine to end')
-        again = start(launch_file(tmp_path, machine, second, volume))
+        again = start(launch_file(tmp_path, cloud_network, second, volume))
         again.wait_for('Publishing')
         assert inside(f'fogros2-{second}', 'cat /data/model; stat -c %U /data/model') == \
             'kept\nfog'
@@ -86,55 +84,6 @@ def test_volume_comes_back_with_the_next_container(
     deleted = ros2('fog', 'volume', 'delete', volume, '--yes')
     assert deleted.returncode == 0, deleted.stderr
     assert volume not in ros2('fog', 'volume', 'list').stdout
-
-
-@pytest.fixture
-def computer(cloud_network: str, tmp_path: Path) -> Iterator[BareComputer]:
-    """Run a computer that may mount, as any that is not a container does."""
-    mounts = [] if embedded() else container_root.environment_mounts(None)
-    with bare_computer(f'fogt-vol-{uuid.uuid4().hex[:6]}', tmp_path / 'computer', cloud_network,
-                       mounts=mounts, options=('--cap-add', 'SYS_ADMIN')) as running:
-        yield running
-
-
-def test_volume_of_an_ssh_host_is_a_folder_with_a_lock(
-    tmp_path: Path, computer: BareComputer, volume: str, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv('HOME', str(tmp_path))
-    config = tmp_path / '.ssh/config'
-    config.parent.mkdir(mode=0o700)
-    known = config.with_name('known_hosts')
-    known.write_text(f'{computer.address} {computer.host_key}\n')
-    config.write_text(f'Host lab\nHostName {computer.address}\nUser {computer.user}\n'
-                      f'IdentityFile {computer.key}\nUserKnownHostsFile {known}\n')
-    machine = "SSHInstance('lab', bootstrap='pip'"
-    first, second = (f'{name}-{uuid.uuid4().hex[:6]}' for name in ('one', 'two'))
-    with launching() as start:
-        run = start(launch_file(tmp_path, machine, first, volume))
-        run.wait_for('Publishing')
-        assert computer.run('stat -c %U /data; echo kept >/data/model').stdout == 'fog\n'
-        refused = ros2('fog', 'volume', 'delete', volume, '--host', 'lab', '--yes')
-        assert refused.returncode == 1 and 'a launch uses the volume' in refused.stderr
-
-        running = ' '.join(computer.leftovers())
-        assert 'agent.py' in running and 'talker' in running and first in running
-        run.kill()
-        wait_until(lambda: computer.leftovers() == [] and computer.run(
-            '[ ! -e /data ]', check=False).returncode == 0,
-            timeout=60.0, what='the agent to end the launch')
-        again = start(launch_file(tmp_path, machine, second, volume))
-        again.wait_for('Publishing')
-        assert computer.run('cat /data/model').stdout == 'kept\n'
-        again.interrupt()
-        assert again.ended() == 0, again.text
-        wait_until(lambda: computer.run('[ ! -e /data ]', check=False).returncode == 0,
-                   timeout=10.0, what='/data to go')
-    assert ros2('fog', 'delete', first, '--yes').returncode == 0
-    assert computer.leftovers() == []
-    listed = ros2('fog', 'volume', 'list', '--host', 'lab')
-    assert volume in listed.stdout
-    assert ros2('fog', 'volume', 'delete', '--host', 'lab', volume, '--yes').returncode == 0
-    assert computer.run(f'ls /home/{computer.user}/.local/share/fogros2-volumes').stdout == ''
 
 
 @pytest.mark.parametrize('content', [b'', b'data of somebody'])
