@@ -151,8 +151,9 @@ def test_jpeg_fills_link_and_never_queues(vpn: Any) -> None:
         assert numbers == sorted(set(numbers))
         assert all(line.get('psnr', 99.0) > 30 for line in lines)
         latencies = sorted(line['latency'] - delay for line in lines)
-        # its own time on the wire, twice: before it leaves, it waits for the one before
-        return len(lines) >= 0.6 * 5.0 / wire \
+        # twice as many as one at a time, whose receipts take a fifth of a second; a latency is an
+        # image's own time on the wire, twice: before it leaves, it waits for the one before
+        return len(lines) >= 0.45 * 5.0 / wire \
             and latencies[len(latencies) // 2] < 3 * wire + 1 / 30 and latencies[-1] < 0.8
 
     # a busy computer may have no time for that many images at first
