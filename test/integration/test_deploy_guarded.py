@@ -17,13 +17,14 @@ import pytest
 
 from fogros2.deploy import Launch
 from fogros2.deploy import launch as launches
+from fogros2.errors import VpnError
 from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.process import run
 from fogros2.provider.container import ContainerProvider, packet_filter
 from fogros2.provider.container import machine as container_machine
 from fogros2.report import StepDone
 from fogros2.store import Store
-from fogros2.waiting import wait_until
+from fogros2.waiting import Timeouts, wait_until
 from fogros2_features.vpn_path import feature as vpn_path
 from rigs.launched import ros2
 from rigs.networks import without_udp
@@ -207,6 +208,15 @@ def test_vpn_leaves_udp_and_returns(cloud, spec, cloud_network, monkeypatch):
         assert server_address(machine) == machine.vpn_address
         with without_udp(cloud_network):
             assert uses('stream', [cloud.robot])
+    finally:
+        assert launch.down() == []
+
+
+def test_udp_alone_fails_and_names_the_remedy(spec, cloud_network):
+    launch = Launch(timeouts=Timeouts(vpn=5.0))
+    try:
+        with without_udp(cloud_network), pytest.raises(VpnError, match="vpn_path='auto'"):
+            launch.up(spec(features={'vpn_path': {'vpn_path': 'udp'}}))
     finally:
         assert launch.down() == []
 
