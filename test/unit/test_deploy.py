@@ -261,6 +261,16 @@ def test_machine_is_deleted_if_its_id_cannot_be_stored(
     assert list(provider.find({})) == []
 
 
+def test_machine_without_a_connection_is_deleted(launch, provider, monkeypatch):
+    def fail(connection):
+        raise ConnectError('no SSH server')
+
+    monkeypatch.setattr(Connection, 'open', fail)
+    with pytest.raises(ConnectError, match='no SSH server'):
+        launch.up(dataclasses.replace(SPEC, on_exit='keep'))
+    assert list(provider.find({})) == [] and not launch.store.exists(SPEC.name)
+
+
 def joined(launch, monkeypatch, name, network):
     """Return a machine of another robot, in the VPN with a network."""
     monkeypatch.setenv('FOGROS2_STATE_HOME', str(launch.store.root))
