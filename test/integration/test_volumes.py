@@ -14,7 +14,7 @@ from fogros2.model import Command
 from fogros2.provider.container import engine as container_engine
 from fogros2.waiting import wait_until
 from fogros2_features import volumes
-from rigs.launched import launching, ros2
+from rigs.launched import Launched, launching, ros2
 
 pytestmark = [pytest.mark.usefixtures('nothing_left', 'engine')]
 
@@ -24,10 +24,11 @@ from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 
 def generate_launch_description():
     machine = ContainerInstance(
-        network='{network}', name='{name}', ros_workspace='', robot_timeout=6,
+        network='{network}', name='{name}', ros_workspace='', robot_timeout=10,
         volumes={{'{volume}': '/data'}})
     return FogROSLaunchDescription([CloudNode(
-        machine=machine, package='fogros2_examples', executable='talker', output='screen')])
+        machine=machine, package='fogros2_examples', executable='talker', respawn=True,
+        output='screen')])
 """
 
 
@@ -50,6 +51,15 @@ def launch_file(folder: Path, network: str, name: str, volume: str) -> str:
     return str(path)
 
 
+def kill_agent(run: Launched, name: str) -> None:
+    """Kill the agent of a machine, whose node starts again."""
+    run.said.clear()
+    inside(f'fogros2-{name}', 'kill -9 $(cat /run/fogros2/agent.pid)')
+    for words in ('its agent died and was started again', 'process started with pid',
+                  'Publishing'):
+        run.wait_for(words)
+
+
 def test_volume_comes_back_with_the_next_container(
     tmp_path: Path, cloud_network: str, volume: str,
 ) -> None:
@@ -69,7 +79,8 @@ def test_volume_comes_back_with_the_next_container(
         refused = ros2('fog', 'volume', 'delete', '--yes', volume)
         assert refused.returncode == 1 and f"'{first}' has the volume" in refused.stderr
 
-        run.kill()  # the agent ends the machine
+        kill_agent(run, first)
+        run.kill()  # the new agent ends the machine
         wait_until(lambda: inside(f'fogros2-{first}', 'echo runs') != 'runs', timeout=60.0,
                    what='the machine to end')
         again = start(launch_file(tmp_path, cloud_network, second, volume))
