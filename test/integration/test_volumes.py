@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Volumes that outlive container machines, and what mounts a volume."""
+"""A volume and a recording that outlive container machines, and what mounts a volume."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from fogros2 import CloudNode, ContainerInstance, FogROSLaunchDescription
 def generate_launch_description():
     machine = ContainerInstance(
         network='{network}', name='{name}', ros_workspace='', robot_timeout=10,
-        volumes={{'{volume}': '/data'}})
+        volumes={{'{volume}': '/data'}}, record=['/chatter'], fetch_to='{home}')
     return FogROSLaunchDescription([CloudNode(
         machine=machine, package='fogros2_examples', executable='talker', respawn=True,
         output='screen')])
@@ -47,7 +47,8 @@ def inside(container: str, script: str) -> str:
 
 def launch_file(folder: Path, network: str, name: str, volume: str) -> str:
     path = folder / f'{name}.launch.py'
-    path.write_text(LAUNCH.format(network=network, name=name, volume=volume))
+    path.write_text(LAUNCH.format(
+        network=network, name=name, volume=volume, home=folder / 'home'))
     return str(path)
 
 
@@ -60,9 +61,21 @@ def kill_agent(run: Launched, name: str) -> None:
         run.wait_for(words)
 
 
-def test_volume_comes_back_with_the_next_container(
+def recording_came_home(folder: Path, name: str) -> None:
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    file, = folder.glob(f'{name}-*/recordings/*.mcap')
+    with file.open('rb') as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        words = [message.data for *_, message in reader.iter_decoded_messages()]
+    assert len(words) >= 3 and all('Hello World' in word for word in words)
+
+
+def test_volume_and_recording_outlive_a_container(
     tmp_path: Path, cloud_network: str, volume: str,
 ) -> None:
+    pytest.importorskip('foxglove', reason='the extra "monitor" is not installed')
     first, second = (f'{name}-{uuid.uuid4().hex[:6]}' for name in ('one', 'two'))
     with launching() as start:
         run = start(launch_file(tmp_path, cloud_network, first, volume))
@@ -84,11 +97,14 @@ def test_volume_comes_back_with_the_next_container(
         wait_until(lambda: inside(f'fogros2-{first}', 'echo runs') != 'runs', timeout=60.0,
                    what='the machine to end')
         again = start(launch_file(tmp_path, cloud_network, second, volume))
-        again.wait_for('Publishing')
+        again.wait_for('recording /chatter to ')
+        again.said.clear()
+        again.wait_for('Publishing', times=8)  # the recorder may find the topic late
         assert inside(f'fogros2-{second}', 'cat /data/model; stat -c %U /data/model') == \
             'kept\nfog'
         again.interrupt()
         assert again.ended() == 0, again.text
+    recording_came_home(tmp_path / 'home', second)
     ros2('fog', 'delete', first, '--yes')
     assert ros2('fog', 'gc').returncode == 0
     assert volume in ros2('fog', 'volume', 'list').stdout
