@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 fog`` beside a launch that runs on a container machine, and after one that was killed."""
+"""
+``ros2 fog`` beside the launch of the tutorial's container machine, and after it was killed.
+
+The tutorial works word for word, on the embedded default and on ROS 2. The name of the machine is
+another one, as tests share the computer.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +26,7 @@ from ros2cli.cli import main
 from fogros2.store import Store
 from fogros2.waiting import wait_until
 from rigs.launched import Launched, launching, ros2, WITH_SIGINT
+from rigs.tutorial import activated, FILE, Tutorial
 
 
 def fog(*words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
@@ -37,16 +43,35 @@ def fog(*words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture
-def launched(
-    nothing_left: None, engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> Iterator[tuple[str, Launched]]:
-    """Launch the example; yield the machine's name and the launch."""
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros'))
-    name = f'cli-{secrets.token_hex(2)}'
+def tutorial(tmp_path: Path) -> Tutorial:
+    return Tutorial(f'cli-{secrets.token_hex(2)}', tmp_path)
+
+
+@pytest.fixture
+def environment(tutorial: Tutorial, tmp_path: Path) -> dict[str, str]:
+    """Return the variables of a terminal of the tutorial."""
+    return activated(tutorial.commands[1], tmp_path)
+
+
+@pytest.fixture
+def launch(
+    nothing_left: None, engine: str, tutorial: Tutorial, environment: dict[str, str],
+) -> Iterator[Launched]:
     with launching() as start:
-        launch = start('fogros2_examples', 'talker.container.launch.py', f'name:={name}')
-        launch.wait_for('I heard')
-        yield name, launch
+        launch = start(*tutorial.words(f'ros2 launch ./{FILE}')[1:], environment=environment)
+        launch.wait_for(f'I heard: [Hello World from {tutorial.name} ')
+        yield launch
+
+
+def commands_of_the_tutorial_work(tutorial: Tutorial, environment: dict[str, str]) -> None:
+    """Run each in a process of its own."""
+    for verb, expected in (
+            ('list', [tutorial.name]), ('status .*', ['running', 'round trip', 'talker']),
+            ('logs .*', ['process started', 'Publishing']), ('connect .*', [tutorial.name])):
+        done = ros2(*tutorial.words(f'ros2 fog {verb}'), environment=environment)
+        # what a node says on stderr comes on stderr
+        text = done.stdout + done.stderr
+        assert done.returncode == 0 and all(words in text for words in expected), done
 
 
 def logs_follow(name: str, children: list[subprocess.Popen[bytes]], folder: Path) -> None:
@@ -78,10 +103,11 @@ def another_terminal_joins(name: str) -> None:
 
 
 def test_verbs_work_beside_a_launch_and_clean_up_after_its_death(
-    launched: tuple[str, Launched], children: list[subprocess.Popen[bytes]], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    launch: Launched, tutorial: Tutorial, environment: dict[str, str],
+    children: list[subprocess.Popen[bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    name, launch = launched
+    name = tutorial.name
+    commands_of_the_tutorial_work(tutorial, environment)
 
     def listed() -> dict[str, Any]:
         (entry,) = [e for e in json.loads(fog('list', '--json').stdout)['machines']
@@ -99,12 +125,7 @@ def test_verbs_work_beside_a_launch_and_clean_up_after_its_death(
     (node,) = status['agent']['nodes']
     assert node['name'].startswith('talker') and node['state'] == 'running'
     assert status['agent']['rss_kb'] < 30000
-    text = fog('status', name).stdout
-    assert 'round trip' in text and 'talker' in text
 
-    logs = fog('logs', name)
-    assert 'process started' in logs.stdout
-    assert 'Publishing' in logs.stdout + logs.stderr
     nobody = fog('logs', name, '--node', 'talkr-1', check=False)
     assert nobody.returncode == 1 and 'Publishing' not in nobody.stdout + nobody.stderr
     assert f"'{name}' has no node 'talkr-1' (did you mean 'talker-1'?)" in nobody.stderr
@@ -141,7 +162,7 @@ def test_verbs_work_beside_a_launch_and_clean_up_after_its_death(
     assert '(orphan)' in [line for line in fog('list').stdout.splitlines() if name in line][0]
     assert f'deleted {name}' in fog('delete', name, '--yes').stdout
     monkeypatch.setenv('FOGROS2_STATE_HOME', here)
-    assert f'leftovers of {name}' in fog('gc').stdout
+    assert f'leftovers of {name}' in fog(*tutorial.words('ros2 fog gc')[1:]).stdout
     assert fog('wait', name, '--gone', '--timeout', '60').returncode == 0
     assert name not in fog('gc').stdout + fog('list').stdout
     assert not Store().machine(name).exists()
