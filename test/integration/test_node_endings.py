@@ -25,7 +25,7 @@ from image_transport_h264 import ending
 print('begins', flush=True)
 ending.run(lambda: Node('idle'))
 """
-STARTS = 8
+STARTS = 4
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
