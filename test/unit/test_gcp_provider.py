@@ -303,6 +303,7 @@ def test_denial_is_between_our_rules_and_googles(gce):
     rules = {rule['name'].partition('-')[2].partition('-')[2]: rule for rule in gce.own_firewalls}
     assert rules['tcp-22']['sourceRanges'] == ['198.51.100.0/28']
     assert rules['vpn']['allowed'] == [{'IPProtocol': 'udp', 'ports': ['51820']}]
+    assert rules['deny']['denied'] == [{'IPProtocol': 'all'}]
     for name in ('tcp-22', 'vpn'):
         assert rules[name]['priority'] < rules['deny']['priority'] < 65534
     # the networks of ssh_from= are admitted together with the others, at port 22 only

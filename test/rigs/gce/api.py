@@ -99,12 +99,6 @@ class Api:
         discovery.check({'$ref': 'ListSkusResponse'}, answer, 'skus', 'cloudbilling')
         return 200, answer
 
-    def token(self) -> str:
-        """Return a token for a client of a test."""
-        token = f'ya29.{secrets.token_urlsafe(20)}'
-        self._tokens.add(token)
-        return token
-
     def _answer(self, environ: Mapping[str, Any], body: bytes) -> tuple[int, Any]:
         query = dict(parse_qsl(environ.get('QUERY_STRING', '')))
         path = environ['PATH_INFO'].removeprefix(discovery.ROOT)
