@@ -53,22 +53,13 @@ def test_three_hosts_exchange_messages(launch, cloud_network):
     assert run.errors == [], run.text
 
 
-def test_nodes_run_on_the_robot_without_a_machine(launch):
-    run = launch('fogros2_examples', 'two_clouds.launch.yaml', 'count:=2',
-                 '--machine', 'speaker=robot', '--machine', 'hear*=robot')
-    assert run.ended() == 0, run.text
-    assert run.text.count('I heard: [Hello World') >= 2
-    assert '[fogros2]' not in run.text, 'a machine was made'
-    assert clean(run), run.text
-
-
 @pytest.mark.parametrize('option', ['-s', '-p'])
 def test_showing_a_launch_file_creates_nothing(option, state_home, capsys):
     for name in (
             'talker.auto_aws.launch.py', 'talker.aws.launch.py', 'talker.budget.launch.py',
             'talker.container.launch.py', 'talker.container.launch.xml', 'talker.kube.launch.py',
             'talker.recorded.launch.py', 'talker.ssh.launch.py', 'talker.volume.launch.py',
-            'two_clouds.launch.py', 'video.container.launch.yaml'):
+            'two_clouds.launch.py', 'two_clouds.launch.yaml', 'video.container.launch.yaml'):
         assert not main(argv=['launch', str(example(name)), option]), name
         shown = capsys.readouterr().out
         assert option == '-p' or "'name':" in shown, name
