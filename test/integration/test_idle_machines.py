@@ -25,7 +25,7 @@ def generate_launch_description():
     waits = [ContainerInstance(name='{name}-kept', on_exit='keep', **common),
              ContainerInstance(name='{name}-seen', **common)]
     works = ContainerInstance(name='{name}-works', **common)
-    work = 'import time\\nwhile True:\\n    sum(range(3 * 10 ** 6)); time.sleep(0.2)'
+    work = 'import time\\nwhile True:\\n    sum(range(10 ** 6)); time.sleep(0.2)'
     return FogROSLaunchDescription([
         *[CloudNode(machine=machine, package='fogros2_examples', executable='listener',
                     respawn=True, remappings=[('chatter', '/nobody')]) for machine in waits],
