@@ -90,23 +90,21 @@ def test_what_goes_in_comes_out(pair: Bench) -> None:
         assert numpy.abs(a - b).mean() < (0.01 if got.encoding == '32FC1' else 4)
 
 
-def test_numbers_of_either_type_are_accepted(bench: Bench) -> None:
-    lines, _ = bench.pair('-p', 'max_rate:=15', '-p', 'quality:=28', '-p', 'bitrate:=2e6')
-    seen = bench.heard(Image, '/seen/camera')
-    bench.until(lambda: seen, f'an image: {lines}', meanwhile=source(bench))
-
-
 def test_how_packets_are_taken(root: None, bench: Bench) -> None:
-    """A deep picture of many datagrams comes over a link that loses every fifth one."""
+    """
+    A deep picture of many datagrams comes over a link that loses every fifth one.
+
+    Parameters are numbers of either type.
+    """
     with bench.lossy():
-        bench.pair()
+        lines, _ = bench.pair('-p', 'max_rate:=15', '-p', 'quality:=28', '-p', 'bitrate:=2e6')
         seen = bench.heard(Image, '/seen/camera')
         for encoding, options, reliability in (
                 ('16UC1', {'pixel': 2, 'width': 640, 'height': 480}, ReliabilityPolicy.RELIABLE),
                 ('bgr8', {}, ReliabilityPolicy.BEST_EFFORT)):
             camera = source(bench, encoding=encoding, **options)
             bench.until(lambda kind=encoding: [got.encoding for got in seen].count(kind) >= 3,
-                        'an image', meanwhile=camera)
+                        f'an image: {lines}', meanwhile=camera)
             bench.until(lambda wanted=reliability: [info.qos_profile.reliability for info in
                                  bench.node.get_subscriptions_info_by_topic('/camera/h264')
                                  ] == [wanted], 'the subscription', meanwhile=camera)
