@@ -32,7 +32,7 @@ RUN = 'FOGROS2_TEST_RUN'
 
 #: Seconds between two looks at state folders, which know a launch for longer than that; and how
 #: many of these looks there are for each one for folders.
-NOTE, FOLDERS = 0.05, 10
+NOTE, FOLDERS = 0.2, 5
 
 #: 'fogt' begins the names of tests of single parts, which tidy up by themselves.
 _SINGLE = 'fogt'
