@@ -21,6 +21,7 @@ from fogros2 import plan, process
 from fogros2.deploy import Launch
 from fogros2.errors import FogError
 from fogros2.model import MachineSpec
+from fogros2.provider.container import engine as container_engine
 from fogros2.provider.container import root as container_root
 from fogros2.store import Store
 from rigs.bare_computer import bare_computer
@@ -168,7 +169,12 @@ def test_damaged_record_is_reported(cloud_network):
 
 def test_name_of_a_foreign_container_is_refused(cloud_network, tmp_path):
     """Somebody else's container is in the way: neither taken over nor removed."""
-    with bare_computer(f'fogros2-{NAME}', tmp_path / 'computer', cloud_network) as stranger:
+    podman, stranger = container_engine.named('podman'), f'fogros2-{NAME}'
+    try:
+        podman.call('create', '--name', stranger, *container_engine.limits(), '--network', 'none',
+                    '--rootfs', str(tmp_path), 'true', what='create a container')
         error, _ = fails('container', network=cloud_network)
         assert f"'{NAME}'" in error and 'already' in error
-        stranger.run('true')
+        podman.call('container', 'exists', stranger, what='look for it')
+    finally:
+        podman.call('rm', '-f', stranger, what='remove it', check=False)
