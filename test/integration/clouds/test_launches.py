@@ -209,6 +209,20 @@ def test_kept_machine_is_a_host_for_the_robots_of_its_fleet(cloud, robot, box, n
 
 
 @pytest.mark.soak
+@pytest.mark.parametrize('cloud', ['aws'], indirect=True, scope='session')
+def test_robot_that_moves_during_the_boot_is_let_in(cloud, robot, box, name):
+    box.set_boot_delay(5.0)
+    run = robot.launch('fogros2_examples', 'talker.aws.launch.py', f'name:={name}', 'count:=1')
+    wait_until(box.alive, timeout=60, what='an instance')
+    box.move_robot()
+    try:
+        assert run.ended() == 0, run.text
+        assert run.clean, run.text
+    finally:
+        box.move_robot(back=True)
+
+
+@pytest.mark.soak
 def test_new_spot_machine_replaces_a_reclaimed_one(cloud, robot, box, name):
     """The old machine is deleted before another one gets its name."""
     run = robot.own(name, {'spot': True, 'on_interrupt': 'replace'})
