@@ -58,8 +58,9 @@ def test_showing_a_launch_file_creates_nothing(option, state_home, capsys):
     for name in (
             'talker.auto_aws.launch.py', 'talker.aws.launch.py', 'talker.budget.launch.py',
             'talker.container.launch.py', 'talker.container.launch.xml', 'talker.kube.launch.py',
-            'talker.recorded.launch.py', 'talker.ssh.launch.py', 'talker.volume.launch.py',
-            'two_clouds.launch.py', 'two_clouds.launch.yaml', 'video.container.launch.yaml'):
+            'talker.recorded.launch.py', 'talker.regions.aws.launch.py', 'talker.ssh.launch.py',
+            'talker.volume.launch.py', 'two_clouds.launch.py', 'two_clouds.launch.yaml',
+            'video.container.launch.yaml'):
         assert not main(argv=['launch', str(example(name)), option]), name
         shown = capsys.readouterr().out
         assert option == '-p' or "'name':" in shown, name
