@@ -21,7 +21,6 @@ import socket
 import ssl
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -829,19 +828,3 @@ def test_unreachable_aws_is_one_line(hasty, monkeypatch):
         with pytest.raises(PrerequisiteError, match='AWS does not answer') as caught:
             ask()
         assert 'AWS_ENDPOINT_URL' in caught.value.hint
-
-
-def test_group_that_ec2_does_not_know_yet_is_deleted(monkeypatch):
-    """A new one may be unknown for some seconds, and would stay."""
-    asked = []
-
-    def call(service, region, operation, what, **words):
-        asked.append((operation, words['GroupId']))
-        if len(asked) == 1:
-            raise failures.AwsError('no such group', code='InvalidGroup.NotFound')
-
-    monkeypatch.setattr(network, 'wait_through', lambda look, **_: look())
-    adapter = SimpleNamespace(_account=SimpleNamespace(
-        call=call, just_made=lambda group: True, made={'sg-1': 0.0}))
-    network.Ec2Network._drop_groups(adapter, 'eu-west-1', '', ['sg-1'], timeout=9.0)
-    assert asked == 2 * [('delete_security_group', 'sg-1')]
