@@ -7,15 +7,7 @@ from decimal import Decimal
 
 import pytest
 
-from fogros2.errors import ProviderError
-from fogros2.model import Command, MachineSpec, MachineState, Result
-from fogros2_testing import (
-    FakeProvider,
-    FakeShell,
-    FakeStream,
-    ProviderContract,
-    request_for,
-)
+from fogros2_testing import FakeProvider, ProviderContract
 
 
 class TestFakeProvider(ProviderContract):
@@ -41,25 +33,3 @@ class TestFakeCloud(TestFakeProvider):
 
     def make(self):
         return self.provider, {'size': 'cheapest'}
-
-
-def test_a_fake_provider_remembers_calls_and_fails_as_told():
-    provider = FakeProvider(failures={'create': ProviderError('no more machines')})
-    spec = MachineSpec('planner', 'fake')
-    with pytest.raises(ProviderError, match='no more machines'):
-        provider.create(spec, request_for(spec))
-    machine_id = provider.create(spec, request_for(spec))
-    assert provider.calls == ['check', 'create', 'check', 'create']
-    provider.describe(machine_id)
-    provider.stop(machine_id)
-    assert provider.describe(machine_id).state is MachineState.STOPPED
-    provider.start(machine_id)
-    assert provider.describe(machine_id).state is MachineState.RUNNING
-
-
-def test_a_fake_shell_answers_as_told():
-    stream = FakeStream()
-    shell = FakeShell(handlers={'uname': lambda c: Result(0, 'Fake\n', '')}, streams=[stream])
-    assert shell.run(Command(('uname', '-s')), timeout=1).stdout == 'Fake\n'
-    assert shell.open(Command(('agent',))) is stream
-    assert shell.commands == [Command(('uname', '-s'))]
