@@ -426,22 +426,6 @@ def test_interrupt_of_a_node_that_starts_is_no_failure(bench: Bench, interrupted
         not interrupted or 'Traceback' not in done.stderr), done.stderr
 
 
-def test_interrupted_import_is_no_failure(bench: Bench, tmp_path: Path) -> None:
-    (tmp_path / 'numpy.py').write_text("""
-import os, signal
-try:
-    os.kill(os.getpid(), signal.SIGINT)
-except KeyboardInterrupt:
-    raise ImportError('as from NumPy')
-""")
-    done = subprocess.run(
-        [sys.executable, str(ROOT / 'image_transport_h264/scripts/encoder')],
-        env={**bench.environment, 'PYTHONPATH':
-             f'{tmp_path}{os.pathsep}{bench.environment["PYTHONPATH"]}'},
-        timeout=60, capture_output=True)
-    assert (done.returncode, done.stderr) == (0, b'')
-
-
 #: Asks how many subscribers there are, before the executor can tell that one has come.
 ASKS = """
 import time
