@@ -6,7 +6,7 @@ what a test leaves behind.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import ipaddress
 import os
 from pathlib import Path
@@ -27,7 +27,7 @@ from fogros2.provider.container import root as container_root
 from rigs.cluster import images as cluster_images
 from rigs.container_machines import cloud_network, engine
 from rigs.domains import taken
-from rigs.launched import embedded
+from rigs.launched import embedded, Launched, launching
 from rigs.traces import nothing_left as nothing_left_of
 from rigs.traces import RUN, Traces
 
@@ -97,6 +97,13 @@ def nothing_left(
     traces = Traces(state_home, tmp_path_factory.getbasetemp(), os.environ[RUN])
     with nothing_left_of(traces, timeout=60.0):
         yield
+
+
+@pytest.fixture
+def launch(nothing_left: None) -> Iterator[Callable[..., Launched]]:
+    """Return what starts launches, which are over when the test ends and leave nothing."""
+    with launching() as start:
+        yield start
 
 
 @pytest.fixture(scope='session')

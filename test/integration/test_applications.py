@@ -20,17 +20,9 @@ from ament_index_python.packages import get_package_prefix, get_package_share_di
 from launch.launch_description_sources import get_launch_description_from_any_launch_file
 import pytest
 
-from rigs.launched import launching
-
 ROOT = Path(__file__).parents[2]
 
 pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='needs ros2 on PATH')
-
-
-@pytest.fixture
-def launch(nothing_left):
-    with launching() as start:
-        yield start
 
 
 def started(executable, *words):

@@ -15,7 +15,6 @@ import pytest
 from ros2cli.cli import main
 
 from rigs.colcon_workspace import colcon_workspace
-from rigs.launched import launching
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -24,12 +23,6 @@ pytestmark = [
 
 #: Other runs of these tests may be under way on the same computer.
 RUN = uuid.uuid4().hex[:6]
-
-
-@pytest.fixture
-def launch():
-    with launching() as start:
-        yield start
 
 
 def example(name):

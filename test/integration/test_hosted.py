@@ -24,7 +24,7 @@ from fogros2.waiting import wait_until
 from fogros2_testing import request_for
 from rigs.container_machines import key
 from rigs.fleet import Fleet, fleet, heard, LAUNCH
-from rigs.launched import Launched, launching, ROS2
+from rigs.launched import Launched, ROS2
 
 __all__ = ['key']
 
@@ -143,12 +143,6 @@ def test_cancelled_creation_leaves_nothing(host: Fleet, key: Path) -> None:
         return not busy and not host.traces()
 
     wait_until(settled, timeout=60.0, what='the engine to finish')
-
-
-@pytest.fixture
-def launch() -> Iterator[Callable[..., Launched]]:
-    with launching() as start:
-        yield start
 
 
 def fog(host: Fleet, robot: str, *words: str) -> str:

@@ -33,7 +33,6 @@ from fogros2_examples.nodes import LATCHED  # noqa: E402
 from fogros2_examples.slam import messages, room  # noqa: E402
 from fogros2_examples.slam.camera import SlamCamera  # noqa: E402
 from fogros2_examples.slam.node import TFMessage  # noqa: E402
-from rigs.launched import launching  # noqa: E402
 
 pytestmark = [
     pytest.mark.usefixtures('nothing_left'),
@@ -41,12 +40,6 @@ pytestmark = [
 ]
 TRANSFORMS = [('/tf', TFMessage, 10)] if TFMessage else []
 SMALL = ('width:=320', 'height:=240', 'frames:=25', 'rate:=20.0')
-
-
-@pytest.fixture
-def launch():
-    with launching() as start:
-        yield start
 
 
 @pytest.mark.skipif(find_spec('evo') is None, reason='evo (the extra "applications") is missing')

@@ -18,7 +18,7 @@ from fogros2.provider.container import root as container_root
 from fogros2.waiting import wait_until
 from rigs.bare_computer import bare_computer
 from rigs.colcon_workspace import colcon_workspace
-from rigs.launched import embedded, launching, ros2
+from rigs.launched import embedded, ros2
 from rigs.second_robot import join, second
 
 __all__ = ['join', 'second']
@@ -54,12 +54,6 @@ def home(tmp_path, monkeypatch):
     monkeypatch.setenv('HOME', str(tmp_path))
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     monkeypatch.delenv('SSH_AUTH_SOCK', raising=False)
-
-
-@pytest.fixture
-def launch():
-    with launching() as start:
-        yield start
 
 
 def example(computer, **arguments):
