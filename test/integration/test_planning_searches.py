@@ -16,10 +16,10 @@ pytest.importorskip('fcl', reason='python-fcl is in the extra applications')
 pytest.importorskip('ompl.base', reason='ompl is in the extra applications')
 
 from fogros2.waiting import wait_until
-from fogros2_examples.meshes import box, joined
 from fogros2_examples.planning.picture import between
 from fogros2_examples.planning.racing import Racer
-from fogros2_examples.planning.scene import MADE, pose, Scene
+from fogros2_examples.planning.scene import MADE, pose
+from rigs.planning_room import box_room
 
 
 def depth(first, second):
@@ -68,14 +68,6 @@ def test_motion_touches_nothing(name):
             if (low < over).all() and (high > under).all():
                 # OMPL looks at poses some centimetres apart
                 assert all(depth(piece, part) < 0.02 for piece in boxes(body)), at
-
-
-def box_room(wall):
-    """Return a room 4 m long; ``wall`` says whether a wall closes its middle."""
-    walls = joined([box((1.9, -1, -1), (2.1, 3, 3))] if wall else [box((1.9, 1, 0), (2.1, 2, 2))])
-    return Scene('room', box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)), walls, joined([]),
-                 numpy.zeros(3), numpy.array([4.0, 2.0, 2.0]), pose(0.5, 0.5, 0.5),
-                 pose(3.5, 0.5, 0.5))
 
 
 @pytest.fixture(scope='module')

@@ -16,7 +16,6 @@ from fogros2_examples.files import BadInput  # noqa: E402 - only where its libra
 from fogros2_examples.meshes import (  # noqa: E402
     box,
     cylinder,
-    joined,
     quaternion,
     rotation,
     sphere,
@@ -24,8 +23,9 @@ from fogros2_examples.meshes import (  # noqa: E402
 )
 from fogros2_examples.planning.app_files import loaded  # noqa: E402
 from fogros2_examples.planning.picture import between, picture, spaced  # noqa: E402
-from fogros2_examples.planning.scene import pose, Scene  # noqa: E402
+from fogros2_examples.planning.scene import pose  # noqa: E402
 from fogros2_examples.planning.search import Space  # noqa: E402
+from rigs.planning_room import box_room  # noqa: E402
 
 
 def volume(mesh):
@@ -48,14 +48,6 @@ def test_quaternions_and_matrices_agree(axis, angle):
     matrix = turned(axis, angle)
     assert rotation(quaternion(matrix)) == pytest.approx(matrix, abs=1e-12)
     assert numpy.trace(matrix) == pytest.approx(1 + 2 * math.cos(angle))
-
-
-def box_room(wall):
-    """Return a room 4 m long; ``wall`` says whether a wall closes its middle."""
-    walls = joined([box((1.9, -1, -1), (2.1, 3, 3))] if wall else [box((1.9, 1, 0), (2.1, 2, 2))])
-    return Scene('room', box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)), walls, joined([]),
-                 numpy.zeros(3), numpy.array([4.0, 2.0, 2.0]), pose(0.5, 0.5, 0.5),
-                 pose(3.5, 0.5, 0.5))
 
 
 @pytest.mark.parametrize('end, farthest', [
