@@ -42,7 +42,7 @@ from fogros2.model import (
 )
 from fogros2.provider import Capabilities, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TAG_ROBOT
 from fogros2.provider.container import ContainerProvider
-from fogros2.store import Made, process_start, Record, robot_name, Store
+from fogros2.store import Made, process_start, Record, robot_name, Store, this_process
 from fogros2.vpn.wireguard import WireGuard
 from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream
 from fogros2_testing.plugins import instead
@@ -112,10 +112,6 @@ def record(name: str, machine_id: Optional[str] = '', provider: str = 'memory',
     return Store().save(made)
 
 
-def alive() -> dict[str, int]:
-    return {'pid': os.getpid(), 'pid_start': process_start(os.getpid()) or 0}
-
-
 @functools.cache
 def dead() -> dict[str, int]:
     child = subprocess.Popen(['true'])
@@ -163,7 +159,7 @@ def test_list_shows_what_providers_and_the_store_know(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     machine('alive', cost_per_hour=Decimal('0.0416'), region='eu-west-1', kind='t3.medium')
-    record('alive', **alive())
+    record('alive', **this_process())
     machine('orphan', cost_per_hour=Decimal('1.2'))
     machine('other', robot='somebody-7')
     machine('idle', state=MachineState.STOPPED, cost_per_hour=Decimal('1.2'))
@@ -206,7 +202,7 @@ def test_list_shows_what_providers_and_the_store_know(
 def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     machine('a', cost_per_hour=Decimal('0.5'), image='ami-1', key='fogros2-a', disk_gb=40,
             endpoint=Endpoint('ssh', '198.51.100.7', 22, 'fog', 'ssh-ed25519 AAAA'))
-    record('a', **alive())
+    record('a', **this_process())
     record('b')
     assert run('list', '--json') == 0
     entry, unknown = json.loads(capsys.readouterr().out)['machines']
@@ -325,7 +321,7 @@ def test_host_that_is_off_is_no_stopped_machine() -> None:
 
 
 def test_machine_that_a_launch_is_creating_is_pending() -> None:
-    record('a', machine_id=None, **alive())
+    record('a', machine_id=None, **this_process())
     record('b', machine_id=None, **dead())
     assert [(entry.state, entry.gone) for entry in machines.survey(lambda text: None)] == [
         ('pending', False), ('gone', True)]
@@ -377,7 +373,7 @@ def test_delete_asks_for_confirmation(
 
 def test_delete_refuses_under_a_running_launch(capsys: pytest.CaptureFixture[str]) -> None:
     machine('a')
-    record('a', **alive())
+    record('a', **this_process())
     said = run('delete', 'a', '--yes')
     assert 'has the machine' in str(said) and '--force' in str(said)
     assert Memory.machines
@@ -411,7 +407,7 @@ def test_machine_that_got_a_record_meanwhile_is_no_orphan(
     machine('a')
     (entry,) = machines.survey(lambda text: None)
     assert entry.record is None
-    record('a', machine_id, last='abc123', **alive())
+    record('a', machine_id, last='abc123', **this_process())
     if refused:
         with pytest.raises(NameTaken, match='has changed meanwhile'):
             endings.delete(entry, Store(), report.silent)
@@ -510,7 +506,7 @@ def test_gc_ends_machines_that_nobody_needs(
     found = machine('a', **{'expires': NOW + 600, **changes})
     known = None
     if record_changes is not None:
-        known = record('a', **(alive() if record_changes == 'alive' else record_changes))
+        known = record('a', **(this_process() if record_changes == 'alive' else record_changes))
     entry = Entry('a', 'memory', found, known)
     said = endings.why_end(entry, NOW, 7 * 86400.0)
     assert said.startswith(reason) and bool(said) == bool(reason)
@@ -524,7 +520,7 @@ def test_gc_clears_and_reports_leftovers(capsys: pytest.CaptureFixture[str]) -> 
     machine('kept')
     record('kept', on_exit='keep', **dead())
     machine('busy')
-    record('busy', **alive())
+    record('busy', **this_process())
     assert run('gc', '--dry-run', '--json') == 0
     would = {entry['name']: entry['reason']
              for entry in json.loads(capsys.readouterr().out)['cleared']}
@@ -561,7 +557,7 @@ def test_gc_fails_if_a_provider_does_not_answer(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     record('a', provider='nosdk', **dead())
-    record('busy', provider='nosdk', **alive())
+    record('busy', provider='nosdk', **this_process())
     assert run('gc') == 1
     assert capsys.readouterr().out == \
         "could not clear machine a: the provider 'nosdk' can't be asked\n"
@@ -743,8 +739,8 @@ def test_container_without_an_engine_on_path_is_not_gone(
 
 def test_leftover_launch_folders_are_found_by_their_process() -> None:
     store = Store()
-    rebooted = {**alive(), 'boot': 'another'}
-    for name, about in (('aaaaaa', alive()), ('bbbbbb', dead()), ('cccccc', None),
+    rebooted = {**this_process(), 'boot': 'another'}
+    for name, about in (('aaaaaa', this_process()), ('bbbbbb', dead()), ('cccccc', None),
                         ('eeeeee', rebooted)):
         folder = store.launch_folder(name)
         if about is not None:
@@ -762,7 +758,7 @@ def test_env_lets_a_terminal_join(capsys: pytest.CaptureFixture[str],
     monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
     monkeypatch.setenv('CYCLONEDDS_URI', '<a b="c\'d"/>')
     machine('a')
-    record('a', **alive())
+    record('a', **this_process())
     assert 'no launch is running' in str(run('env', 'a'))
     path = Store().launch_folder('abc123') / 'dds.xml'
     path.write_text('<x/>')
@@ -795,7 +791,7 @@ def joined(monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the folder of a launch that runs with the machine 'a'."""
     monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
     machine('a')
-    record('a', **alive())
+    record('a', **this_process())
     folder = Store().launch_folder('abc123')
     for name, text in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '42'), ('dds.xml', '<x/>')):
         (folder / name).write_text(text)

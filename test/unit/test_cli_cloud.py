@@ -48,7 +48,7 @@ from fogros2.provider import (
 from fogros2.provider.machine_types import Region
 from fogros2.provider.vm.failures import Silent
 from fogros2.provider.vm.images import Image
-from fogros2.store import process_start, Record, robot_name, Store
+from fogros2.store import Record, robot_name, Store, this_process
 from fogros2.waiting import wait_until
 from fogros2_features.images import baking, pods
 from fogros2_monitor import access
@@ -151,10 +151,9 @@ def machine(name: str, **changes: Any) -> Machine:
 
 
 def record(name: str, *, alive: bool = False, **changes: Any) -> Record:
-    process = (os.getpid(), process_start(os.getpid()) or 0) if alive else (0, 0)
     made = Record(name, 'cloud', MachineSpec(name, 'cloud'), machine_id=f'id-{name}',
                   created=time.time() - 600, launch='abc123' if alive else '',
-                  pid=process[0], pid_start=process[1],
+                  **(this_process() if alive else {}),
                   endpoint=Endpoint('ssh', '198.51.100.7', 22, 'ubuntu', 'ssh-ed25519 BBBB',
                                  '/keys/id_ed25519'))
     return Store().save(dataclasses.replace(made, **changes))

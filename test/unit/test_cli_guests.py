@@ -36,6 +36,7 @@ from fogros2.store import (
     process_start,
     Record,
     Store,
+    this_process,
     write_private,
 )
 from fogros2_features.guests import invitation, listing, membership, program, provider
@@ -66,8 +67,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
         'fogabc123m0', '198.18.7.2', '198.18.7.0/24', 50000, '/run/key')
     store.save(Record(
         'planner', 'memory', MachineSpec('planner', 'memory'), machine_id='id', launch='abc123',
-        pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, public_key=OTHER,
-        armed=time.time(), agent_program=__file__,
+        public_key=OTHER, armed=time.time(), agent_program=__file__, **this_process(),
         vpn=interface, robot_vpn=dataclasses.replace(interface, name='fogabc123')))
     for name, content in (('rmw', 'rmw_cyclonedds_cpp'), ('domain', '7')):
         write_private(store.launch_folder('abc123') / name, content.encode())

@@ -20,7 +20,7 @@ from ros2cli.cli import main
 from fogros2 import process, waiting
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, TAG_NAME, TAG_ROBOT
-from fogros2.store import process_start, Record, robot_name, Store
+from fogros2.store import process_start, Record, robot_name, Store, this_process
 from fogros2_testing.fakes import FakeProvider
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api import awaiting, bugreport, output, reach, ssh_settings
@@ -137,8 +137,8 @@ def test_wait_goes_on_while_a_launch_replaces_the_machine(
     monkeypatch.setattr(awaiting.machines, 'recorded', look)
     record('a')
     steps(('a', 'machine', 'failed'))
-    (Store().launch_folder('abc123') / 'process.json').write_text(json.dumps(
-        {'pid': os.getpid(), 'pid_start': process_start(os.getpid())}))
+    (Store().launch_folder('abc123') / 'process.json').write_text(
+        json.dumps(this_process()))
     assert run('wait', 'a', '--timeout', '20') == 0 and len(looks) == 3
 
 

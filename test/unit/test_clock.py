@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import contextlib
 import json
-import os
 from pathlib import Path
 import socket
 import threading
@@ -22,7 +21,7 @@ from fogros2.clock import ClockOffset, OffsetAlarm, OffsetFilter, SAMPLES
 from fogros2.deploy.steps.watching import ClockComparison
 from fogros2.model import MachineSpec
 from fogros2.report import ClockMeasured, Event
-from fogros2.store import boot_id, process_start, Record, Store
+from fogros2.store import Record, Store, this_process
 from fogros2.waiting import wait_until
 from ros2fog_cli.api import doctor, reach
 
@@ -174,7 +173,7 @@ def launched(store: Store, name: str, *lines: str) -> Record:
     """Return the record of a machine of this very process's launch, with that journal."""
     (store.launch_folder('abc123') / journal.FILE).write_text('\n'.join(lines))
     record = Record(name, 'container', MachineSpec(name, 'container'), launch='abc123',
-                    pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, boot=boot_id())
+                    **this_process())
     return store.save(record)
 
 

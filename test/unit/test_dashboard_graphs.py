@@ -6,7 +6,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator
 import json
-import os
 from pathlib import Path
 import sys
 import time
@@ -15,7 +14,7 @@ from typing import Any
 import pytest
 
 from fogros2.model import MachineSpec
-from fogros2.store import process_start, Record, Store
+from fogros2.store import Record, Store, this_process
 from fogros2.waiting import wait_until
 from ros2fog_cli.api import graphs
 from ros2fog_cli.api.graphs import Graphs
@@ -45,8 +44,8 @@ def launched(launch: str = 'abc123', **changes: Any) -> Record:
     folder = Store().launch_folder(launch)
     (folder / 'rmw').write_text('rmw_cyclonedds_cpp')
     (folder / 'domain').write_text('42')
-    return Record('a', 'memory', MachineSpec('a', 'memory'), launch=launch, **{
-        'pid': os.getpid(), 'pid_start': process_start(os.getpid()) or 0, **changes})
+    return Record('a', 'memory', MachineSpec('a', 'memory'), launch=launch,
+                  **{**this_process(), **changes})
 
 
 def instead(monkeypatch: pytest.MonkeyPatch, program: str) -> None:

@@ -20,7 +20,7 @@ from fogros2.journal import Journal
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
 from fogros2.provider import Capabilities, TAG_NAME, TAG_ROBOT
 from fogros2.report import silent, StepDone, StepStarted
-from fogros2.store import process_start, Record, robot_name, Store
+from fogros2.store import Record, robot_name, Store, this_process
 from fogros2.waiting import wait_until
 from fogros2_testing.fakes import FakeProvider
 from fogros2_testing.plugins import instead
@@ -66,10 +66,6 @@ def machine(name: str, **changes: Any) -> Record:
     return Store().save(dataclasses.replace(made, **changes))
 
 
-def alive() -> dict[str, Any]:
-    return {'pid': os.getpid(), 'pid_start': process_start(os.getpid()) or 0}
-
-
 def when(live: Live, name: str, fits: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """Return a machine of the state once it is as it should be."""
     def found() -> Any:
@@ -83,11 +79,11 @@ def when(live: Live, name: str, fits: Callable[[dict[str, Any]], bool]) -> dict[
 def test_machine_is_shown_from_its_steps_to_its_end(live: Live) -> None:
     assert live.state(0, 5.0)['machines'] == []
     folder = Store().launch_folder('abc123')
-    (folder / 'process.json').write_text(json.dumps(alive()))
+    (folder / 'process.json').write_text(json.dumps(this_process()))
     keep = Journal(silent, folder)
     keep(StepStarted('', 'VPN interface'))
     keep(StepStarted('a', 'machine'))
-    machine('a', **alive())
+    machine('a', **this_process())
     shown = when(live, 'a', lambda one: bool(one['steps']))
     assert shown['phase'] == 'coming' and shown['launch_pid'] == os.getpid()
     keep(StepDone('a', 'machine', 1.5, 'there'))
@@ -116,7 +112,7 @@ def test_machine_is_shown_from_its_steps_to_its_end(live: Live) -> None:
 
 
 def test_deletion_is_refused_forced_and_reported(live: Live) -> None:
-    machine('a', **alive())
+    machine('a', **this_process())
     machine('stuck')
     when(live, 'a', lambda one: one['cost_per_hour'] is not None and one['launch_pid'])
     with pytest.raises(NameTaken, match='has the machine'):
@@ -159,9 +155,9 @@ def test_machines_of_one_name_are_separate(request: pytest.FixtureRequest) -> No
 
     wait_until(lambda: len(shown()) == 2, timeout=60.0, what='both')
     assert shown() == {'a': 'id-1', 'a id-2': 'id-2'}
-    Store().save(Record('a', 'memory', MachineSpec('a', 'memory'), **alive()))
+    Store().save(Record('a', 'memory', MachineSpec('a', 'memory'), **this_process()))
     wait_until(lambda: shown().get('a') is None, timeout=60.0, what='the third')
-    machine('a', **alive())
+    machine('a', **this_process())
     wait_until(lambda: shown() == {'a': 'id-a', 'a id-1': 'id-1', 'a id-2': 'id-2'},
                timeout=60.0, what='all three')
     live.delete('a id-2')
@@ -192,7 +188,7 @@ def test_defect_of_a_feature_leaves_its_last_rows(monkeypatch: pytest.MonkeyPatc
 
     instead(monkeypatch, 'fogros2.feature', {'mine': Mine})
     monkeypatch.setattr('ros2fog_cli.api.live.LOOK', 0.02)
-    machine('a', **alive())
+    machine('a', **this_process())
     live = Live()
     live.start()
     try:

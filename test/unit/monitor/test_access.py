@@ -25,7 +25,7 @@ from fogros2.model import Endpoint, Machine, MachineSpec, MachineState, VpnInter
 from fogros2.provider.kubernetes import manifests, ways
 from fogros2.provider.kubernetes.names import MachineId
 from fogros2.runtime import added_process
-from fogros2.store import Made, process_start, Record, Store
+from fogros2.store import Made, Record, Store, this_process
 from fogros2_monitor import access, action, addresses
 from fogros2_monitor.browser import Ticket
 from fogros2_monitor.feature import Monitor
@@ -117,8 +117,7 @@ def test_next_launch_closes_the_port_of_a_killed_one(
 def entry(**changes):
     made = Record(
         'planner', 'fake', MachineSpec('planner', 'fake'), machine_id='fake-1', launch='abc123',
-        pid=os.getpid(), pid_start=process_start(os.getpid()) or 0, vpn=VPN, notes=NOTES,
-        agent='/run/fogros2')
+        vpn=VPN, notes=NOTES, agent='/run/fogros2', **this_process())
     return Entry('planner', 'fake', Machine(
         'fake-1', 'planner', 'fake', MachineState.RUNNING, endpoint=Endpoint('fake')),
         dataclasses.replace(made, **changes))
