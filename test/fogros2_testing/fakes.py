@@ -201,6 +201,14 @@ class FakeProvider(Provider):
             raise self.failures.pop(method)
 
 
+class MemoryProvider(FakeProvider):
+    """One for tests of verbs: each verb has its own object, and all have the same machines."""
+
+    name: ClassVar[str] = 'memory'
+    capabilities: ClassVar[Capabilities] = Capabilities()
+    machines: dict[str, Machine] = {}
+
+
 class FakeVpn(Vpn):
     """A VPN whose commands do nothing; their arguments are the names of the peers."""
 

@@ -44,7 +44,7 @@ from fogros2.provider import Capabilities, TAG_EXPIRES, TAG_LAUNCH, TAG_NAME, TA
 from fogros2.provider.container import ContainerProvider
 from fogros2.store import Made, process_start, Record, robot_name, Store, this_process
 from fogros2.vpn.wireguard import WireGuard
-from fogros2_testing.fakes import FakeProvider, FakeShell, FakeStream
+from fogros2_testing.fakes import FakeShell, FakeStream, MemoryProvider
 from fogros2_testing.plugins import instead
 from rigs import recorded_agent
 from ros2fog_cli.api import endings, machines, table
@@ -54,12 +54,9 @@ NOW = 1_800_000_000.0
 LAB_VPN = VpnInterface('fogabc123m0', '198.18.0.2', '198.18.0.0/24', 51820, '/none')
 
 
-class Memory(FakeProvider):
-    """A provider with its machines in a dictionary."""
+class Memory(MemoryProvider):
+    """One with a machine that can't be deleted."""
 
-    name = 'memory'
-    capabilities = Capabilities()
-    machines: dict[str, Machine] = {}
     searched: list[str] = []
 
     def destroy(self, machine_id: str) -> None:

@@ -29,7 +29,6 @@ from fogros2.model import (
     to_json,
     VpnInterface,
 )
-from fogros2.provider import Capabilities
 from fogros2.store import (
     launch_process,
     OTHER_VPN,
@@ -40,7 +39,7 @@ from fogros2.store import (
     write_private,
 )
 from fogros2_features.guests import invitation, listing, membership, program, provider
-from fogros2_testing.fakes import FakeProvider, FakeShell
+from fogros2_testing.fakes import FakeShell, MemoryProvider
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api import endings, progress, reach
 from ros2fog_cli.api.reach import Link
@@ -50,19 +49,11 @@ MACHINE = Machine('id', 'planner', 'memory', MachineState.RUNNING, time.time(),
                   Endpoint('ssh', '203.0.113.9'), vpn_host='203.0.113.9', vpn_port=30000)
 
 
-class Memory(FakeProvider):
-    """A provider with one machine."""
-
-    name = 'memory'
-    capabilities = Capabilities()
-    machines: dict[str, Machine] = {}
-
-
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
     """Return what the machine is asked; its list of guests has one."""
-    instead(monkeypatch, 'fogros2.provider', {'memory': Memory})
-    Memory.machines = {'id': MACHINE}
+    instead(monkeypatch, 'fogros2.provider', {'memory': MemoryProvider})
+    MemoryProvider.machines = {'id': MACHINE}
     store, interface = Store(), VpnInterface(
         'fogabc123m0', '198.18.7.2', '198.18.7.0/24', 50000, '/run/key')
     store.save(Record(
@@ -125,7 +116,7 @@ def test_invitation_names_all_that_the_joiner_needs(
 def test_machine_that_nobody_can_dial_is_one_clear_error(
     asked: list[tuple[str, Any]], capsys: pytest.CaptureFixture[str],
 ) -> None:
-    Memory.machines = {'id': dataclasses.replace(
+    MemoryProvider.machines = {'id': dataclasses.replace(
         MACHINE, vpn_host='', robot_host='198.51.100.1')}
     assert "'planner' dials the robot" in fog('invite', 'planner', '--key', OTHER)
     assert capsys.readouterr().out == '' and asked == []

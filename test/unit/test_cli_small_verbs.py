@@ -19,9 +19,9 @@ from ros2cli.cli import main
 
 from fogros2 import process, waiting
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
-from fogros2.provider import Capabilities, TAG_NAME, TAG_ROBOT
+from fogros2.provider import TAG_NAME, TAG_ROBOT
 from fogros2.store import process_start, Record, robot_name, Store, this_process
-from fogros2_testing.fakes import FakeProvider
+from fogros2_testing.fakes import MemoryProvider
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api import awaiting, bugreport, output, reach, ssh_settings
 from ros2fog_cli.api.doctor import Check
@@ -40,18 +40,10 @@ PLANTED = {
 }
 
 
-class Cloud(FakeProvider):
-    """A provider with its machines in a dictionary."""
-
-    name = 'memory'
-    capabilities = Capabilities()
-    machines: dict[str, Machine] = {}
-
-
 @pytest.fixture(autouse=True)
 def memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    Cloud.machines = {}
-    instead(monkeypatch, 'fogros2.provider', {'memory': Cloud})
+    MemoryProvider.machines = {}
+    instead(monkeypatch, 'fogros2.provider', {'memory': MemoryProvider})
 
 
 def run(*words: str) -> Any:
@@ -63,7 +55,7 @@ def machine(name: str, **changes: Any) -> Machine:
                    endpoint=Endpoint('ssh', '198.51.100.7', 2200, 'fog', 'ssh-ed25519 AAAA'),
                    tags={TAG_NAME: name, TAG_ROBOT: robot_name()})
     made = dataclasses.replace(made, **changes)
-    Cloud.machines[made.id] = made
+    MemoryProvider.machines[made.id] = made
     return made
 
 

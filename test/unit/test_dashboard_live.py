@@ -18,21 +18,17 @@ from fogros2.errors import MachineNotFound, NameTaken, ProviderError
 from fogros2.feature import Feature
 from fogros2.journal import Journal
 from fogros2.model import Endpoint, Machine, MachineSpec, MachineState
-from fogros2.provider import Capabilities, TAG_NAME, TAG_ROBOT
+from fogros2.provider import TAG_NAME, TAG_ROBOT
 from fogros2.report import silent, StepDone, StepStarted
 from fogros2.store import Record, robot_name, Store, this_process
 from fogros2.waiting import wait_until
-from fogros2_testing.fakes import FakeProvider
+from fogros2_testing.fakes import MemoryProvider
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api.live import Live
 
 
-class Memory(FakeProvider):
-    """A provider with its machines in a dictionary."""
-
-    name = 'memory'
-    capabilities = Capabilities()
-    machines: dict[str, Machine] = {}
+class Memory(MemoryProvider):
+    """One with a machine that can't be deleted."""
 
     def destroy(self, machine_id: str) -> None:
         if machine_id == 'id-stuck':

@@ -22,7 +22,6 @@ from fogros2 import events, plugin_system
 from fogros2.clock import ClockOffset
 from fogros2.journal import Step
 from fogros2.model import MachineSpec, Volume
-from fogros2.provider import Capabilities
 from fogros2.provider.machine_types import MachineType
 from fogros2.provider.vm.images import Image
 from fogros2.store import Record, Store
@@ -32,7 +31,7 @@ from fogros2_features.prices import verbs as price
 from fogros2_features.prices.offers import Offer
 from fogros2_features.volumes import listing
 from fogros2_replicas import figures
-from fogros2_testing.fakes import FakeProvider
+from fogros2_testing.fakes import MemoryProvider
 from fogros2_testing.plugins import instead
 from ros2fog_cli.api import output, shown, watching
 from ros2fog_cli.api.doctor import Check
@@ -45,17 +44,10 @@ PAGE = (ROOT / 'doc' / 'reference' / 'scripts.md').read_text()
 CONSTANTS = {'FOGROS2_FILE', 'FOGROS2_SOURCE', 'FOGROS2_VPN'}
 
 
-class Cloud(FakeProvider):
-    """A provider without machines."""
-
-    name = 'memory'
-    capabilities = Capabilities()
-    machines: dict[str, Any] = {}
-
-
 @pytest.fixture(autouse=True)
 def memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    instead(monkeypatch, 'fogros2.provider', {'memory': Cloud})
+    monkeypatch.setattr(MemoryProvider, 'machines', {})
+    instead(monkeypatch, 'fogros2.provider', {'memory': MemoryProvider})
 
 
 def section(heading: str) -> str:
@@ -205,6 +197,7 @@ def test_verbs_end_with_the_statuses_of_the_page(capsys: pytest.CaptureFixture[s
 def test_interrupted_verb_ends_with_the_status_of_the_page(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Cloud, 'find', lambda self, tags: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(MemoryProvider, 'find', lambda self, tags: (
+        _ for _ in ()).throw(KeyboardInterrupt))
     Store().save(Record('a', 'memory', MachineSpec('a', 'memory')))
     assert int(main(argv=['fog', 'list'])) == 2
