@@ -259,11 +259,11 @@ class CloudInstance:
             return values.resolve_deferred(context, value)
 
     def _option(self, name: str) -> Any:
-        """Return an option: resolved if the machine is up, else its plain value or description."""
-        if self._running is not None:
-            return self._running.spec.options.get(name)
-        value = (self._spec.options if self._spec else self._options).get(name)
-        return values.plain(value)
+        """Return an option's value of the region: resolved once up, else plain or described."""
+        described = self._running.spec if self._running else self._spec
+        options = described.options if described else self._options
+        region, value = (values.plain(options.get(key)) for key in ('region', name))
+        return value.get(region, value) if isinstance(value, Mapping) else value
 
 
 class ContainerInstance(CloudInstance):

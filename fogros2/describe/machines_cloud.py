@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
-from typing import Any, Optional, TYPE_CHECKING, TypedDict, Union
+from typing import Any, ClassVar, Optional, TYPE_CHECKING, TypedDict, Union
 
 from fogros2.describe.kinds import options_of
 from fogros2.describe.machines import CloudInstance
@@ -55,6 +55,11 @@ class VmInstance(CloudInstance):
         container machines on this one (``ContainerInstance(on=SSHInstance(...))``).
     """
 
+    #: FogROS2's keys of :meth:`info` that are options.
+    _shown: ClassVar[Mapping[str, str]] = {}
+    #: The key of the cloud's own id, and its part of the machine's id.
+    _shown_id: ClassVar[Mapping[str, int]] = {}
+
     def __init__(
         self, *, spot: Optional[Bool] = None,
         arch: Optional[SomeSubstitutionsType] = None,
@@ -72,6 +77,14 @@ class VmInstance(CloudInstance):
     ) -> None:
         shared = options_of(VmInstance.__init__, locals())
         super().__init__(options={**(options or {}), **shared}, **common)
+
+    def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
+        """Return what is known about the machine, with FogROS2's keys."""
+        known = super().info(flush_to_disk)
+        known.update((key, self._option(name)) for key, name in self._shown.items())
+        known.update((key, self._running.machine.id.split('/')[part] if self._running else None)
+                     for key, part in self._shown_id.items())
+        return known
 
 
 class AWSCloudInstance(VmInstance):
@@ -98,6 +111,9 @@ class AWSCloudInstance(VmInstance):
     """
 
     provider = 'aws'
+    _shown = {'ec2_region': 'region', 'ec2_instance_type': 'ec2_instance_type',
+              'disk_size': 'disk_size', 'aws_ami_image': 'ami_image'}
+    _shown_id = {'ec2_instance_id': -1}
 
     def __init__(
         self, ami_image: Optional[ByRegion] = None,
@@ -111,24 +127,6 @@ class AWSCloudInstance(VmInstance):
         **common: Any,
     ) -> None:
         super().__init__(options=options_of(AWSCloudInstance.__init__, locals()), **common)
-
-    def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
-        """Return what is known about the machine, with FogROS2's keys."""
-        machine = self._running.machine if self._running else None
-        region = self._option('region')
-
-        def regional(name: str) -> Any:
-            value = self._option(name)
-            return value.get(region, value) if isinstance(value, Mapping) else value
-
-        return {
-            **super().info(flush_to_disk),
-            'ec2_region': region,
-            'ec2_instance_type': regional('ec2_instance_type'),
-            'disk_size': self._option('disk_size'),
-            'aws_ami_image': regional('ami_image'),
-            'ec2_instance_id': machine.id.rpartition('/')[2] if machine else None,
-        }
 
 
 class GCPCloudInstance(VmInstance):
@@ -154,6 +152,8 @@ class GCPCloudInstance(VmInstance):
     """
 
     provider = 'gcp'
+    _shown = {'compute_instance_type': 'machine_type', 'disk_size': 'disk_size'}
+    _shown_id = {'compute_instance_id': -2}
 
     def __init__(
         self, project_id: Optional[SomeSubstitutionsType] = None,
@@ -172,14 +172,8 @@ class GCPCloudInstance(VmInstance):
 
     def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
         """Return what is known about the machine, with FogROS2's keys."""
-        machine = self._running.machine if self._running else None
-        return {
-            **super().info(flush_to_disk),
-            'compute_region': self._option('zone') or self._option('region'),
-            'compute_instance_type': self._option('machine_type'),
-            'disk_size': self._option('disk_size'),
-            'compute_instance_id': machine.id.split('/')[-2] if machine else None,
-        }
+        return {'compute_region': self._option('zone') or self._option('region'),
+                **super().info(flush_to_disk)}
 
 
 class KubeInstance(CloudInstance):
@@ -269,6 +263,9 @@ class AzureCloudInstance(VmInstance):
     """
 
     provider = 'azure'
+    _shown = {'compute_region': 'region', 'compute_instance_type': 'vm_size',
+              'disk_size': 'disk_size'}
+    _shown_id = {'compute_instance_id': 1}
 
     def __init__(
         self, resource_group: Optional[SomeSubstitutionsType] = None,
@@ -293,14 +290,3 @@ class AzureCloudInstance(VmInstance):
                                              f'leave {other}= out')
                 options[name] = value
         super().__init__(options=options, **common)
-
-    def info(self, flush_to_disk: bool = False) -> dict[str, Any]:
-        """Return what is known about the machine, with the keys of pull request 109."""
-        machine = self._running.machine if self._running else None
-        return {
-            **super().info(flush_to_disk),
-            'compute_region': self._option('region'),
-            'compute_instance_type': self._option('vm_size'),
-            'disk_size': self._option('disk_size'),
-            'compute_instance_id': machine.id.split('/')[1] if machine else None,
-        }

@@ -140,6 +140,17 @@ def test_info_has_fogros2_s_keys(context):
     told = machine.info()
     assert (told['ec2_region'], told['ec2_instance_type']) == ('us-west-2', 't3.nano')
     assert told['ec2_instance_id'] == 'i-0123'
+    cloud = fogros2.GCPCloudInstance(region='europe-west3', machine_type='e2-small')
+    assert (cloud.info()['compute_region'], cloud.info()['compute_instance_type']) == (
+        'europe-west3', 'e2-small')
+    cloud.spec(context)
+    cloud.is_up(SimpleNamespace(
+        spec=SimpleNamespace(provider='gcp', options={'zone': 'europe-west3-a'}),
+        machine=SimpleNamespace(
+            id='gcp:robots/europe-west3-a/cloud-1/77', vpn_host='198.51.100.7', endpoint=None),
+        vpn_address='198.18.0.2'))
+    told = cloud.info()
+    assert (told['compute_region'], told['compute_instance_id']) == ('europe-west3-a', 'cloud-1')
     pod = KubeInstance(mcpu=100, mb=200, zone='b').info()
     assert (pod['compute_region'], pod['compute_instance_type']) == ('b', '100mx200Mb')
 
