@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-import contextlib
 import json
 import os
 import re
@@ -48,20 +47,11 @@ def prefix_of(package: str, path: str) -> str:
 
     :raises Refused: the package is not on this machine.
     """
-    prefixes = [prefix for prefix in path.split(':') if prefix]
-    for prefix in prefixes:
-        if '/' not in package and os.path.isfile(f'{prefix}/{INDEX}/{package}'):
+    for prefix in path.split(':'):
+        if prefix and '/' not in package and os.path.isfile(f'{prefix}/{INDEX}/{package}'):
             return prefix
-    import difflib
-    others: set[str] = set()
-    for prefix in prefixes:
-        with contextlib.suppress(OSError):
-            others.update(os.listdir(f'{prefix}/{INDEX}'))
-    # a broken link has a package's name too
-    near = difflib.get_close_matches(package, others - {package}, n=1, cutoff=0.75)
-    raise Refused(
-        f"package '{package}' not found on the machine",
-        f"did you mean '{near[0]}'?" if near else 'is its workspace the one that travels?')
+    raise Refused(f"package '{package}' not found on the machine",
+                  'is its workspace the one that travels?')
 
 
 def find_executable(package: str, executable: str, path: str) -> str:
@@ -70,15 +60,10 @@ def find_executable(package: str, executable: str, path: str) -> str:
 
     :raises Refused: the package or the executable is not on this machine.
     """
-    folder = f'{prefix_of(package, path)}/lib/{package}'
-    names = sorted(
-        name for name in (os.listdir(folder) if os.path.isdir(folder) else ())
-        if os.path.isfile(f'{folder}/{name}') and os.access(f'{folder}/{name}', os.X_OK))
-    if executable in names:
-        return f'{folder}/{executable}'
-    raise Refused(
-        f"executable '{executable}' not found in package '{package}' on the machine",
-        f"it has: {', '.join(names[:20])}" if names else 'it has none there')
+    program = f'{prefix_of(package, path)}/lib/{package}/{executable}'
+    if '/' not in executable and os.path.isfile(program) and os.access(program, os.X_OK):
+        return program
+    raise Refused(f"executable '{executable}' not found in package '{package}' on the machine")
 
 
 def check_program(program: str, path: str, cwd: str) -> None:

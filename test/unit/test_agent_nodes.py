@@ -70,19 +70,12 @@ def test_unknown_markers_are_refused(text: Any) -> None:
         programs.resolve(text, {}, '')
 
 
-def test_unknown_package_is_refused_with_the_nearest_name(prefix: str) -> None:
+def test_unknown_package_is_refused(prefix: str) -> None:
     with pytest.raises(Refused, match="package 'packk' not found") as caught:
         programs.prefix_of('packk', f'/none:{prefix}')
-    assert caught.value.answer['hint'] == "did you mean 'pack'?"
+    assert caught.value.answer['hint'] == 'is its workspace the one that travels?'
     with pytest.raises(Refused, match="package '../x' not found"):
         programs.prefix_of('../x', prefix)
-
-
-def test_package_with_a_broken_link_gets_no_suggestion(prefix: str, tmp_path: Path) -> None:
-    Path(prefix, programs.INDEX, 'rob_tools').symlink_to(tmp_path / 'gone')
-    with pytest.raises(Refused) as caught:
-        programs.prefix_of('rob_tools', prefix)
-    assert caught.value.answer['hint'] == 'is its workspace the one that travels?'
 
 
 @pytest.mark.parametrize(('program', 'hint'), [
@@ -104,10 +97,9 @@ def test_first_prefix_with_a_package_wins(prefix: str, tmp_path: Path) -> None:
 
 def test_executable_is_found_in_its_package(prefix: str) -> None:
     assert programs.find_executable('pack', 'talker', prefix) == f'{prefix}/lib/pack/talker'
-    for name in ('listener', 'notes', ''):
-        with pytest.raises(Refused) as caught:
+    for name in ('listener', 'notes', '', '../pack/talker'):
+        with pytest.raises(Refused, match=f"executable '{name}' not found in package 'pack'"):
             programs.find_executable('pack', name, prefix)
-        assert caught.value.answer['hint'] == 'it has: talker'
 
 
 def test_spec_becomes_a_command_line(prefix: str, prepared: Prepared, tmp_path: Path) -> None:
