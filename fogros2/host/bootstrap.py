@@ -31,6 +31,7 @@ from fogros2.host import workspace as workspaces
 from fogros2.host.inspection import DISTRO, HostFacts, MIN_PYTHON, Python
 from fogros2.model import Bootstrap, Command, MachineSpec
 from fogros2.plan import (
+    below,
     DEFAULT_RMW,
     extended,
     has_wheels,
@@ -331,9 +332,8 @@ def plan(
         raise PrerequisiteError(
             f"{machine} can't be made ready for ROS 2: {reason}",
             'choose an image or computer with Ubuntu 24.04, or one that has ROS 2 already')
-    install = dataclasses.replace(
-        todo.install, facts=facts, robot=robot,
-        environment=_merged(todo.install, under, chain))
+    install = dataclasses.replace(todo.install, facts=facts, robot=robot)
+    install = dataclasses.replace(install, environment=_merged(install, under, chain))
     return dataclasses.replace(
         todo, tools=tools, install=_with_workspaces(
             install, chain, spec.name, todo.mode == 'apt' or _builds(facts)))
@@ -407,18 +407,42 @@ def _merged(
     """Return the robot's plain variables and workspace folders, then the install's variables."""
     merged = {name: under.environment[name] for name in PLAIN_VARIABLES
               if name in under.environment and name not in _ROS_VARIABLES}
-    below = tuple(f'{space.root}/' for space in chain)
+    roots = [str(space.root) for space in chain]
+    last = _ros_folders(install, under)
     for name in PATH_LISTS:
         # of the robot's folders, a machine has only those that are sent
         entries = [entry for entry in under.environment.get(name, '').split(os.pathsep)
-                   if entry.startswith(below)]
+                   if below(entry, roots)]
         own = install.environment.get(name)
         entries += [own] if own else []
         if entries:
-            merged[name] = os.pathsep.join(entries)
+            merged[name] = os.pathsep.join([*entries, *last.get(name, ())])
     for name, value in install.environment.items():
         merged.setdefault(name, value)
     return merged
+
+
+def _ros_folders(install: RosInstall, under: Underlay) -> dict[str, tuple[str, ...]]:
+    """
+    Return the folders of a machine's ROS 2 in each list of folders, none with its wheels.
+
+    The setup script prepends a folder only to a list without it. At the end of a list, it stays
+    after those of the workspaces and of this package.
+    """
+    if not install.setup:
+        return {}
+    prefix, facts = os.path.dirname(install.setup[0]), install.facts
+    usual = {
+        'AMENT_PREFIX_PATH': [prefix], 'COLCON_PREFIX_PATH': [prefix],
+        'CMAKE_PREFIX_PATH': [prefix],
+        'PYTHONPATH': [f'{prefix}/lib/python{major}.{minor}/site-packages'
+                       for major, minor in sorted({one.version for one in facts.pythons})],
+        'LD_LIBRARY_PATH': [f'{prefix}/lib/{facts.architecture}-linux-gnu', f'{prefix}/lib'],
+        'PATH': [f'{prefix}/bin', SYSTEM_PATH]}
+    # the robot may have the same installation, with more folders
+    return {name: tuple(dict.fromkeys([
+        *(entry for entry in under.environment.get(name, '').split(os.pathsep)
+          if below(entry, [prefix])), *usual[name]])) for name in PATH_LISTS}
 
 
 def _tools(facts: HostFacts, mode: Bootstrap, machine: str) -> tuple[Command, ...]:

@@ -184,7 +184,8 @@ def test_auto_takes_ros_where_it_is() -> None:
     assert todo == plan(ROS, 'none') and todo.mode == 'none' and todo.wheels_target
     assert todo.install.kind == 'ros'
     assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)
-    assert todo.install.environment['PYTHONPATH'] == '/home/ubuntu/.local/share/fogros2/k1/site'
+    assert todo.install.environment['PYTHONPATH'] == (
+        '/home/ubuntu/.local/share/fogros2/k1/site:/opt/ros/jazzy/lib/python3.12/site-packages')
     assert todo.install.environment['ROS_DOMAIN_ID'] == '7'
     assert 'ROS_DISTRO' not in todo.install.environment
     again = plan(dataclasses.replace(ROS, installed=frozenset({'k1'})))
@@ -422,6 +423,133 @@ def test_the_workspace_s_folders_come_before_the_install_s_own(tmp_path: Path) -
     assert todo.install.environment['PATH'].startswith(f'{venv}/bin:')
     assert '/robot' not in ''.join(todo.install.environment.values())
     assert [way.commands for way in todo.install.workspaces] == [()]
+
+
+#: Lists of a robot that has ROS in ``{ros}``, and package a of a workspace.
+LISTS = {
+    'AMENT_PREFIX_PATH': '{ws}/install/a:{ros}', 'CMAKE_PREFIX_PATH': '{ros}/opt/b:{ros}',
+    'PYTHONPATH': '{ws}/install/a/lib/python3.12/site-packages:{ros}/lib/python3.12/site-packages',
+    'LD_LIBRARY_PATH': '{ws}/install/a/lib:{ros}/opt/b/lib:{ros}/lib:/home/me/lib',
+    'PATH': '{ws}/install/a/bin:{ros}/bin:/home/me/bin'}
+
+
+def lists(
+    root: Path, ros: str, facts: HostFacts, *, mode: Any = 'auto', wheels: Wheels = WHEELS,
+    leave_out: tuple[str, ...] = (), packages: tuple[str, ...] = ('a',),
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return the variables and the scripts of a machine's nodes: the robot's ROS is in ``ros``."""
+    for name in packages:
+        marker = root / 'install' / name / 'share/ament_index/resource_index/packages' / name
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
+    environment = {name: text.format(ws=root, ros=ros) for name, text in LISTS.items()
+                   if name not in leave_out}
+    install = bootstrap.plan(
+        MachineSpec('m', 'ssh', workspace=str(root), bootstrap=mode), facts, NOBLE,
+        Underlay((ros,), environment), wheels, [bootstrap.workspaces.inspect(root)]).install
+    return dict(install.environment), install.setup
+
+
+@pytest.mark.parametrize('facts, mode', [(ROS, 'auto'), (NOBLE, 'apt')])
+def test_workspace_and_fogros2_come_before_the_machine_s_ros(
+    facts: HostFacts, mode: Any, tmp_path: Path,
+) -> None:
+    environment, setup = lists(tmp_path, '/opt/ros/jazzy', facts, mode=mode)
+    ros, ours = '/opt/ros/jazzy', '/home/ubuntu/.local/share/fogros2/k1/site'
+    assert setup == (f'{ros}/setup.sh',)
+    assert environment == {
+        'AMENT_PREFIX_PATH': f'{tmp_path}/install/a:{ours}/prefix:{ros}',
+        'PYTHONPATH': f'{tmp_path}/install/a/lib/python3.12/site-packages:{ours}:'
+                      f'{ros}/lib/python3.12/site-packages',
+        'LD_LIBRARY_PATH': f'{tmp_path}/install/a/lib:{ros}/opt/b/lib:{ros}/lib:'
+                           f'{ros}/lib/x86_64-linux-gnu',
+        'PATH': f'{tmp_path}/install/a/bin:{ros}/bin:{bootstrap.SYSTEM_PATH}'}
+
+
+def test_folders_of_the_robot_s_own_ros_stay_here(tmp_path: Path) -> None:
+    environment, _ = lists(tmp_path, '/srv/ros', dataclasses.replace(
+        ROS, architecture='aarch64', pythons=(*DEBIAN.pythons, PYTHON)))
+    ros, ours = '/opt/ros/jazzy', '/home/ubuntu/.local/share/fogros2/k1/site'
+    assert environment == {
+        'AMENT_PREFIX_PATH': f'{tmp_path}/install/a:{ours}/prefix:{ros}',
+        'PYTHONPATH': f'{tmp_path}/install/a/lib/python3.12/site-packages:{ours}:'
+                      f'{ros}/lib/python3.12/site-packages:{ros}/lib/python3.13/site-packages',
+        'LD_LIBRARY_PATH': f'{tmp_path}/install/a/lib:{ros}/lib/aarch64-linux-gnu:{ros}/lib',
+        'PATH': f'{tmp_path}/install/a/bin:{ros}/bin:{bootstrap.SYSTEM_PATH}'}
+    # the robot's prefix is beside the machine's, or both have it
+    beside, _ = lists(tmp_path, '/opt/ros/jazzy2', ROS)
+    assert 'jazzy2' not in ''.join(beside.values())
+    same, setup = lists(tmp_path, '/srv/ros', dataclasses.replace(ROS, ros={'jazzy': '/srv/ros'}))
+    assert setup == ('/srv/ros/setup.sh',)
+    assert same['LD_LIBRARY_PATH'].startswith(f'{tmp_path}/install/a/lib:/srv/ros/opt/b/lib:')
+
+
+def test_lists_without_sent_folders_are_left_to_ros_itself(tmp_path: Path) -> None:
+    environment, _ = lists(tmp_path, '/opt/ros/jazzy', ROS,
+                           leave_out=('AMENT_PREFIX_PATH', 'LD_LIBRARY_PATH', 'PATH'))
+    assert {*environment} == {'AMENT_PREFIX_PATH', 'PYTHONPATH'}  # of this package
+    # this package is in the workspace
+    environment, _ = lists(tmp_path, '/opt/ros/jazzy', ROS, leave_out=('PATH', 'PYTHONPATH'),
+                           packages=('a', 'fogros2'))
+    assert {*environment} == {'AMENT_PREFIX_PATH', 'LD_LIBRARY_PATH'}
+    assert environment['AMENT_PREFIX_PATH'] == f'{tmp_path}/install/a:/opt/ros/jazzy'
+
+
+def test_wheels_come_with_no_folder_of_ros(tmp_path: Path) -> None:
+    environment, setup = lists(tmp_path, '/opt/ros/jazzy', NOBLE)
+    venv = '/home/ubuntu/.local/share/fogros2/k1-3.12/venv'
+    assert setup == () and environment == {
+        'AMENT_PREFIX_PATH': f'{tmp_path}/install/a:{venv}', 'VIRTUAL_ENV': venv,
+        'PYTHONPATH': f'{tmp_path}/install/a/lib/python3.12/site-packages',
+        'LD_LIBRARY_PATH': f'{tmp_path}/install/a/lib',
+        'PATH': f'{tmp_path}/install/a/bin:{venv}/bin:{bootstrap.SYSTEM_PATH}'}
+
+
+def ros_prefix(prefix: Path) -> None:
+    """Write an installation of ROS with package a, and the scripts of the real one."""
+    templates = pytest.importorskip(
+        'ament_package.templates', reason='needs ament-package of tools/interfaces.txt')
+    for path, text in (
+            ('share/ament_index/resource_index/packages/a', ''),
+            ('lib/python3.12/site-packages/a.py', 'print("machine")'), ('bin/tool', ''),
+            ('share/a/package.dsv', 'prepend-non-duplicate;AMENT_PREFIX_PATH;\n'
+             'prepend-non-duplicate;LD_LIBRARY_PATH;lib\n'
+             'prepend-non-duplicate-if-exists;PATH;bin\n'
+             'prepend-non-duplicate;PYTHONPATH;lib/python3.12/site-packages\n')):
+        (prefix / path).parent.mkdir(parents=True, exist_ok=True)
+        (prefix / path).write_text(text)
+    values = {'CMAKE_INSTALL_PREFIX': str(prefix), 'SKIP_PARENT_PREFIX_PATH': '',
+              'ament_package_PYTHON_EXECUTABLE': sys.executable}
+    for name in ('setup.sh.in', 'local_setup.sh.in', '_local_setup_util.py'):
+        template = templates.get_prefix_level_template_path(name)
+        (prefix / name.removesuffix('.in')).write_text(
+            templates.configure_file(template, values) if name.endswith('.in')
+            else Path(template).read_text())
+
+
+@pytest.mark.parametrize('robot', ['/opt/ros/jazzy', '{prefix}'])
+def test_overlay_wins_on_a_machine_with_the_real_scripts(tmp_path: Path, robot: str) -> None:
+    root, prefix = tmp_path / 'ws', tmp_path / 'ros'
+    ros_prefix(prefix)
+    module = root / 'install/a/lib/python3.12/site-packages/a.py'
+    module.parent.mkdir(parents=True)
+    module.write_text('print("workspace")')
+    environment, setup = lists(root, robot.format(prefix=prefix), dataclasses.replace(
+        ROS, ros={'jazzy': str(prefix)}))
+    names = ('AMENT_PREFIX_PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH', 'PATH')
+    command = installer.among_nodes(environment, setup, '\n'.join([
+        *(f'echo ${name}' for name in names), f'{sys.executable} -c "import a"']), 'look')
+    result = process.run(command, timeout=30)
+    first = [f'{root}/install/a', f'{root}/install/a/lib/python3.12/site-packages',
+             f'{root}/install/a/lib', f'{root}/install/a/bin']
+    after = [str(prefix), f'{prefix}/lib/python3.12/site-packages', f'{prefix}/lib',
+             f'{prefix}/bin']
+    *lines, imported = result.stdout.split()
+    assert imported == 'workspace'
+    for line, mine, theirs in zip(lines, first, after, strict=True):
+        entries = line.split(':')
+        assert entries[0] == mine and entries.count(theirs) == 1
+    assert lines[-1].endswith(f':{bootstrap.SYSTEM_PATH}')
 
 
 def test_what_is_built_there_gets_all_that_it_declares(

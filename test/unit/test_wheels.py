@@ -146,7 +146,8 @@ def test_workspace_with_fogros2_needs_no_wheel(tmp_path):
     todo = bootstrap.plan(spec, other, robot, under, packed, [workspace])
     assert not todo.wheels_target and todo.commands == ()
     assert todo.install.setup == ('/opt/ros/jazzy/setup.sh',)
-    assert todo.install.environment['AMENT_PREFIX_PATH'] == f'{root}/install/fogros2'
+    assert todo.install.environment['AMENT_PREFIX_PATH'] == (
+        f'{root}/install/fogros2:/opt/ros/jazzy')
 
 
 def test_fetching_ends_when_the_launch_does(tmp_path, monkeypatch):
