@@ -21,7 +21,7 @@ from typing import Any, Optional, TYPE_CHECKING, TypeVar
 from urllib.parse import urlencode, urlsplit
 
 from fogros2.clock import ServerClock
-from fogros2.errors import DeadlineExceeded, ProviderError
+from fogros2.errors import DeadlineExceeded, PrerequisiteError, ProviderError
 from fogros2.kubernetes_client import configuration as kubeconfig
 from fogros2.kubernetes_client.answers import (
     ApiError,
@@ -68,6 +68,7 @@ class Api:
 
     def __init__(self, context: str = '') -> None:
         self.context, self.namespace, self._client = kubeconfig.load(context)
+        self._renewing = threading.Lock()
         self._lost = -DOUBT
         self.clock = ServerClock()
 
@@ -81,6 +82,23 @@ class Api:
         return {each['key']: each['value']
                 for each in self._client.configuration.auth_settings().values()
                 if each['in'] == 'header' and each['value']}
+
+    def _renewed(self, client: Any) -> bool:
+        """
+        After status 401, read the kubeconfig again: the user may have logged in again.
+
+        The official client renews only the tokens of login programs.
+
+        :param client: the client whose credentials the API server refused.
+        :returns: whether there is another client for the same API server.
+        """
+        with self._renewing:
+            if self._client is client:
+                with contextlib.suppress(PrerequisiteError):
+                    other = kubeconfig.load(self.context)[2]
+                    if other.configuration.host == self.server:
+                        self._client = other
+            return self._client is not client
 
     # -- requests -------------------------------------------------------------------------------
 
@@ -181,6 +199,18 @@ class Api:
         :param read: time-out of silence in seconds; None: no time-out.
         :raises Unreachable: no response began.
         """
+        client = self._client
+        response = self._send(method, path, body, query, read)
+        if response.status == 401 and self._renewed(client):
+            response.release_conn()
+            response = self._send(method, path, body, query, read)
+        self.clock.note(response.headers.get('Date', ''))
+        return response
+
+    def _send(
+        self, method: str, path: str, body: Optional[Mapping[str, Any]], query: Query,
+        read: Optional[float],
+    ) -> Any:
         import urllib3
 
         headers = {'accept': 'application/json', **self.headers()}
@@ -188,14 +218,12 @@ class Api:
             headers['content-type'] = 'application/merge-patch+json' \
                 if method == 'PATCH' else 'application/json'
         try:
-            response = self._client.rest_client.pool_manager.request(
+            return self._client.rest_client.pool_manager.request(
                 method, self._url(path, query), headers=headers, preload_content=False,
                 body=None if body is None else json.dumps(body).encode(), retries=False,
                 timeout=urllib3.Timeout(connect=CONNECT, read=read))
         except http_errors() as error:
             raise self._unreachable(error) from error
-        self.clock.note(response.headers.get('Date', ''))
-        return response
 
     def _url(self, path: str, query: Query) -> str:
         words = {name: value for name, value in query.items() if value is not None}
@@ -285,14 +313,7 @@ class Api:
 
     # -- exec -----------------------------------------------------------------------------------
 
-    def websocket(self, path: str, query: Query, *, timeout: float) -> websocket.WebSocket:
-        """
-        Open a WebSocket to a pod's ``exec``.
-
-        :param timeout: time-out in seconds.
-        :raises ApiError: the API server refused, or there is no such pod.
-        :raises Unreachable: the API server does not answer.
-        """
+    def _websocket(self, path: str, query: Query, timeout: float) -> websocket.WebSocket:
         import websocket
 
         options: dict[str, Any] = {}
@@ -316,6 +337,22 @@ class Api:
             raise refusal(error.status_code, parsed(data), data) from error
         except (websocket.WebSocketException, OSError) as error:
             raise self._unreachable(error) from error
+
+    def websocket(self, path: str, query: Query, *, timeout: float) -> websocket.WebSocket:
+        """
+        Open a WebSocket to a pod's ``exec``.
+
+        :param timeout: time-out in seconds.
+        :raises ApiError: the API server refused, or there is no such pod.
+        :raises Unreachable: the API server does not answer.
+        """
+        client = self._client
+        try:
+            return self._websocket(path, query, timeout)
+        except ApiError as error:
+            if error.status != 401 or not self._renewed(client):
+                raise
+            return self._websocket(path, query, timeout)
 
 
 def existing(

@@ -304,6 +304,40 @@ def test_a_refusal_keeps_its_words(api, server):
     assert server.asked[0][3]['content-type'] == 'application/json'
 
 
+@pytest.mark.parametrize(('ask', 'answer'), [
+    (lambda api: api.request('POST', '/x', {}), (201, {})),
+    (lambda api: follow(api, lambda kind, thing: kind), (200, [event('ADDED', 'a')])),
+    (lambda api: api.websocket('/exec', {}, timeout=5.0), (404, {}))])
+def test_credentials_that_expired_are_read_again(api, server, tmp_path, ask, answer):
+    expired = refusal(401, 'Unauthorized', 'Unauthorized')
+    server.answers = [expired, expired]
+    assert raised(ApiError, lambda: ask(api)).status == 401
+    # the user logs in again, with another current context and another namespace
+    path = kubeconfig(tmp_path / 'config', api.server, token='a-new-token')
+    path.write_text(path.read_text().replace('current-context: first', 'current-context: second')
+                    .replace('robots', 'others'))
+    server.asked.clear()
+    server.answers = [expired, answer]
+    if answer[0] < 400:
+        ask(api)
+    else:
+        assert raised(ApiError, lambda: ask(api)).status == answer[0]
+    assert [headers['authorization'] for *_, headers in server.asked] == [
+        'Bearer a-token', 'Bearer a-new-token']
+    assert (api.context, api.namespace) == ('first', 'robots')
+
+
+def test_another_cluster_of_the_same_name_is_not_asked(api, server, tmp_path):
+    expired = refusal(401, 'Unauthorized', 'Unauthorized')
+    for other in ('http://127.0.0.1:9', ''):
+        (tmp_path / 'config').unlink()
+        if other:
+            kubeconfig(tmp_path / 'config', other, token='of another')
+        server.answers = [expired]
+        assert raised(ApiError, lambda: api.request('GET', '/x')).status == 401
+    assert [headers['authorization'] for *_, headers in server.asked] == 2 * ['Bearer a-token']
+
+
 def test_an_overloaded_server_is_asked_again(api, server):
     server.answers = [refusal(429, 'TooManyRequests', 'later'), (503, 'no JSON object'),
                       (200, {'a': 1})]
