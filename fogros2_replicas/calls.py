@@ -21,7 +21,7 @@ from fogros2_replicas.figures import Figures
 HedgeAfter = Union[None, float, Literal['p95']]
 #: A replica that leaves this many requests unanswered, which others have answered, is too slow.
 BEHIND = 16
-#: Requests of one replica that may be without an answer.
+#: Requests to a service, and requests of one replica, that may be without an answer.
 MOST = 256
 #: Seconds between two requests to a replica that is left out (PROBE), or that is not needed
 #: (REFRESH): its answers show its latency. After PROBE, a request without any answer goes to a
@@ -45,7 +45,14 @@ class Answer:
     response: Any
 
 
-Action = Union[Send, Answer]
+@dataclasses.dataclass(frozen=True)
+class Drop:
+    """Forget a request: its client has no answer from any replica."""
+
+    call: int
+
+
+Action = Union[Send, Answer, Drop]
 
 
 @dataclasses.dataclass
@@ -83,8 +90,16 @@ class Calls:
         self._calls: dict[int, _Call] = {}
 
     def ask(self, now: float, call: int) -> list[Action]:
-        """Return whom to send a new request; ``call`` is its number."""
+        """Return whom to send a new request, and which one to drop; ``call`` is its number."""
         one = self._calls[call] = _Call(deadline=now + self._deadline)
+        if len(self._calls) > MOST:  # clients that ask again have given up the oldest one
+            oldest = next(iter(self._calls))
+            del self._calls[oldest]
+            return [Drop(oldest), *self._first(now, call, one)]
+        return self._first(now, call, one)
+
+    def _first(self, now: float, call: int, one: _Call) -> list[Action]:
+        """Send a new request."""
         live = self._live() or self._at_last(one)
         if not live:
             return self._send_to_any(now, call, one)

@@ -32,7 +32,7 @@ from rclpy.task import Future
 
 from fogros2 import ros_types
 from fogros2_replicas import figures
-from fogros2_replicas.calls import Action, Answer, Calls, MOST
+from fogros2_replicas.calls import Action, Answer, Calls, Drop, MOST
 from fogros2_replicas.pairs import Header, header_of, Pair
 from image_transport_h264 import ending
 from image_transport_h264.lazy import every, printable
@@ -98,6 +98,11 @@ class _Served:
         for action in actions:
             if isinstance(action, Answer):
                 self._waiting.pop(action.call)[1].set_result(action.response)
+                continue
+            if isinstance(action, Drop):
+                # rclpy sends no response, and ``main`` handles the error
+                self._waiting.pop(action.call)[1].set_exception(RuntimeError(
+                    f'an answer of {self.name}, as {MOST} later requests have none either'))
                 continue
             client, futures = self._clients[action.replica], self._asked[action.replica]
             future = futures[action.call] = client.call_async(self._waiting[action.call][0])

@@ -20,6 +20,7 @@ from rclpy.context import Context
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -132,6 +133,35 @@ def test_failure_is_answered_when_all_have_failed(bench):
     # a name that replicas share is reported
     bench.said("/status: the node 'planner' of each replica has this name")
     assert 'get_parameters' not in ''.join(bench.lines)
+
+
+def test_oldest_of_many_requests_without_an_answer_is_dropped(bench, tmp_path):
+    (tmp_path / 'sitecustomize.py').write_text(
+        'from fogros2_replicas import calls\ncalls.MOST = 2\n')
+    released, asked = Future(), []
+
+    async def hold(request, response):
+        asked.append(request.prefixes[0])
+        await released
+        response.result.names = request.prefixes
+        return response
+
+    bench.serve('a', Sum, hold)
+    bench.start(['/plan'], first=[str(tmp_path)])
+    bench.until(lambda: [row['state'] for row in bench.all_rows()].count('live') == 1, 'a replica')
+    client = bench.client.create_client(Sum, '/plan')
+    assert client.wait_for_service(20.0), ''.join(bench.lines)
+    futures = []
+    for name in '1234':
+        futures.append(client.call_async(Sum.Request(prefixes=[name])))
+        bench.until(lambda name=name: name in asked, 'the request')
+    bench.said('not sent: an answer of /plan, as 2 later requests have none either')
+    released.set_result(None)
+    bench.executor.wake()
+    assert [bench.answer(future).result.names for future in futures[2:]] == [['3'], ['4']]
+    assert not futures[0].done() and not futures[1].done()
+    # the node goes on
+    assert bench.answer(client.call_async(Sum.Request(prefixes=['5']))).result.names == ['5']
 
 
 def test_reported_death_sends_the_request_on(bench):

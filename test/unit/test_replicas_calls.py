@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import pytest
 
 from fogros2_replicas import figures
-from fogros2_replicas.calls import Answer, BEHIND, Calls, MOST, PROBE, REFRESH, Send
+from fogros2_replicas.calls import Answer, BEHIND, Calls, Drop, MOST, PROBE, REFRESH, Send
 from fogros2_replicas.node import FirstAnswer
 
 NAMES = ('a', 'b', 'c')
@@ -327,6 +327,23 @@ def test_figures_are_written_when_they_change(calls, tmp_path):
     calls.died(1.0, 'a')
     FirstAnswer._write(node)
     assert 'died' in file.read_text()
+
+
+@pytest.mark.parametrize('after', [None, 40.0])
+def test_requests_that_nobody_answers_do_not_add_up(after):
+    calls, drops = ready(Calls(['a', 'b'], after)), []
+    for call in range(3 * MOST):
+        drops += [action for action in calls.ask(0.5 * call, call) if isinstance(action, Drop)]
+        calls.due(0.5 * call)
+    now = 0.5 * call
+    assert drops == [Drop(old) for old in range(2 * MOST)]
+    # an answer to a dropped request shows that the replica is back, and answers nobody
+    assert calls.answered(now, call - MOST + 1, 'a', 'yes') == [Answer(call - MOST + 1, 'yes')]
+    assert calls.answered(now, call - MOST, 'a', 'yes') == []
+    for name in 'ab':
+        calls.died(now, name)
+    calls.started('a')
+    assert len(calls.ready(now, []) + calls.ready(now, ['a'])) == MOST - 1
 
 
 def test_replica_that_hangs_for_weeks_has_few_requests():
