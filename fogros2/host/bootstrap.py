@@ -153,7 +153,7 @@ def ensure(
     shell: Shell, under: Underlay, spec: MachineSpec, *, timeout: float,
     cancel: Optional[threading.Event] = None, ready: Callable[[], object] = lambda: None,
     on_plan: Callable[[RosInstall], object] = lambda install: None, elsewhere: bool = False,
-    packages: Sequence[str] = (), at_home: bool = False,
+    packages: Sequence[str] = (), at_home: bool = False, owned: bool = True,
     warn: Callable[[str, str], object] = lambda text, hint: None,
 ) -> tuple[RosInstall, str]:
     """
@@ -167,6 +167,8 @@ def ensure(
     :param elsewhere: refuse a machine with this computer's network, see ``check_elsewhere``.
     :param packages: packages of the nodes that will run there.
     :param at_home: send workspaces to the login user's home; other users may have the same paths.
+    :param owned: whether the launch has created the machine; its packages of ROS 2 are upgraded
+        if others are installed.
     :param warn: takes a warning and its remedy.
     :returns: how ROS programs run there, and what was done in a few words.
     :raises ConfigurationError: the machine has this computer's network.
@@ -197,7 +199,7 @@ def ensure(
             raise PrerequisiteError(
                 f"the packages for '{spec.name}' can't be packed on this computer: {error}",
                 'XDG_CACHE_HOME names another folder for it') from error
-        todo = plan(spec, facts, robot, under, wheels, chain)
+        todo = plan(spec, facts, robot, under, wheels, chain, owned=owned)
         # with the wheels, the machine gets a copy of this environment
         prefixes = (sys.prefix,) if todo.install.kind == 'pip' else ()
     install = todo.install
@@ -209,7 +211,7 @@ def ensure(
     needed = installer.Needs(
         spec.name, facts, installer.able(spec.bootstrap, facts), spec.apt, spec.pip,
         needs.outside(keys, prefixes), extended(install.environment, spec.environment),
-        install.setup)
+        install.setup, owned)
     if needed.pip or needed.keys:
         install = dataclasses.replace(install, environment=needed.with_folder(install.environment))
     ready()
@@ -232,6 +234,8 @@ def ensure(
             retried(functools.partial(send, fetched, f'{todo.wheels_target}-fetched'))
             run(_install_wheels(facts, wheels, wheel_cache.hashes(fetched)))
     notes = [todo.note]
+    if todo.mode == 'apt' and not owned:
+        installer.check_upgrades(spec.name, run, warn)
     if needed.apt or needed.pip or needed.keys:
         notes += installer.install(needed, run, warn, always=install.kind == 'pip')
     return install, ', '.join(notes)
@@ -289,13 +293,14 @@ def plan_alike(
 
 def plan(
     spec: MachineSpec, facts: HostFacts, robot: HostFacts, under: Underlay,
-    wheels: wheel_cache.Wheels, chain: Sequence[workspaces.Workspace] = (),
+    wheels: wheel_cache.Wheels, chain: Sequence[workspaces.Workspace] = (), *, owned: bool = True,
 ) -> Preparation:
     """
     Decide how a machine with another environment than the robot's gets what its nodes need.
 
     :param wheels: wheels that the robot can send.
     :param chain: the workspaces, overlays first.
+    :param owned: see ``ensure``.
     :raises PrerequisiteError: ``spec.bootstrap`` cannot prepare this machine.
     :raises WorkspaceError: the workspace cannot be used there.
     """
@@ -326,7 +331,7 @@ def plan(
             'make room there' if 'are free' in no_pip else
             "bootstrap='auto' takes another way where there is one")
     elif not no_apt:
-        todo = _apt(facts, wheels, chain, (*apt_packages(under.rmw), *spec.apt))
+        todo = _apt(facts, wheels, chain, (*apt_packages(under.rmw), *spec.apt), owned)
     else:
         reason = no_apt if mode == 'apt' else f'{no_pip}; {no_apt}'
         raise PrerequisiteError(
@@ -633,11 +638,11 @@ def _ros(
 
 def _apt(
     facts: HostFacts, wheels: wheel_cache.Wheels, chain: Sequence[workspaces.Workspace],
-    packages: Sequence[str],
+    packages: Sequence[str], owned: bool,
 ) -> Preparation:
     """Return the plan that installs ROS 2's and the user's packages, and adds this package."""
     ours = _ros(facts, wheels, chain)
-    commands = [installer.apt_install(packages, f'install ROS 2 {DISTRO}')]
+    commands = [installer.apt_install(packages, f'install ROS 2 {DISTRO}', upgrade=owned)]
     if DISTRO not in facts.ros:
         commands = [
             installer.apt_install(('ca-certificates', 'curl', 'gpg')),

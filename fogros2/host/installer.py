@@ -55,6 +55,13 @@ do
     sleep 5
 done
 """
+#: Prints the installed packages of ROS 2, without those that are held.
+_INSTALLED = ("dpkg-query -W -f '${db:Status-Want} ${db:Status-Status} ${Package}\\n' "
+              f"'ros-{DISTRO}-*' 2>/dev/null | sed -n 's/^install installed //p'")
+#: Prints the packages of ROS 2 that have an upgrade.
+_UPGRADABLE = f"""\
+LC_ALL=C apt-get -s --with-new-pkgs upgrade | sed -n 's/^Inst \\(ros-{DISTRO}-[^ ]*\\).*/\\1/p'
+"""
 #: Prints the Debian packages that are not installed.
 _MISSING = """\
 for name; do
@@ -211,6 +218,7 @@ class Needs:
     :param environment: variables of the nodes; ``setup`` has scripts to source.
     :param facts: facts of the machine, ``machine`` its name.
     :param able: whether Debian packages can be installed there.
+    :param owned: whether the machine is the launch's own: others' packages are not upgraded.
     """
 
     machine: str
@@ -221,6 +229,7 @@ class Needs:
     keys: tuple[str, ...] = ()
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)
     setup: tuple[str, ...] = ()
+    owned: bool = True
 
     @property
     def folder(self) -> str:
@@ -300,7 +309,10 @@ def install(
             notes.append(f"the machine lacks {', '.join(lacking)}")
         elif lacking:
             with _remedy('apt= of the machine and package.xml of the workspace name packages'):
-                run(apt_install(lacking))
+                pinned = [name for name in apt if '=' in name]
+                run(apt_install(lacking, pinned=pinned, upgrade=needs.owned))
+            if not needs.owned and any(map(_of_ros, lacking)):
+                check_upgrades(needs.machine, run, warn)
             notes.append(f"installed {', '.join(lacking)}")
     if not (apt or pip or always):
         return notes
@@ -415,15 +427,49 @@ def lacks(machine: str, packages: Sequence[str]) -> PrerequisiteError:
                              f"on the machine: apt-get install {' '.join(packages)}")
 
 
-def apt_install(packages: Sequence[str], what: str = '') -> Command:
+def check_upgrades(
+    machine: str, run: Callable[..., Result], warn: Callable[[str, str], object],
+) -> None:
+    """Warn of packages of ROS 2 that are older than those that were just installed."""
+    older = run(Command(('sh', '-c', _UPGRADABLE), what='look for upgrades'), check=False)
+    if names := older.stdout.split():
+        warn(f"machine '{machine}' has older packages of ROS 2 beside the new ones, such as "
+             f'{names[0]}: nodes may end with an undefined symbol',
+             'on the machine: sudo apt-get --with-new-pkgs upgrade')
+
+
+def apt_install(
+    packages: Sequence[str], what: str = '', *, pinned: Sequence[str] = (), upgrade: bool = True,
+) -> Command:
     """
     Return the command that installs Debian packages.
 
     :param what: by default the packages' names.
+    :param pinned: packages with a version that stays.
+    :param upgrade: with a package of ROS 2, upgrade those that are there.
     """
     return Command.script(
-        APT.format(packages=shlex.join(packages)), sudo=True,
+        APT.format(packages=_words(packages, pinned, upgrade=upgrade)), sudo=True,
         what=what or f"install {', '.join(packages)}")
+
+
+def _of_ros(package: str) -> bool:
+    return package.startswith(f'ros-{DISTRO}-')
+
+
+def _words(packages: Sequence[str], pinned: Sequence[str] = (), *, upgrade: bool = True) -> str:
+    """
+    Return the packages to install, as words for sh.
+
+    Each release of ROS 2's packages is built together, and they name no versions of each other:
+    new ones fail with 'undefined symbol' beside old ones.
+    """
+    words = shlex.join(packages)
+    if not (upgrade and any(map(_of_ros, packages))):
+        return words
+    named = [name.partition('=')[0] for name in (*packages, *pinned) if '=' in name]
+    without = ''.join(f' | grep -vxF {shlex.quote(name)}' for name in dict.fromkeys(named))
+    return f'{words} $({_INSTALLED}{without})'
 
 
 def image_script(packages: Sequence[str], keys: Sequence[str]) -> str:
@@ -432,7 +478,7 @@ def image_script(packages: Sequence[str], keys: Sequence[str]) -> str:
 
     What a key needs of pip, a launch installs in the folder for that.
     """
-    script = APT.format(packages=shlex.join(packages))
+    script = APT.format(packages=_words(packages))
     if keys:
         script += (f'distro={DISTRO}\nset -- {shlex.join(keys)}\nresolved=$(\n{_RESOLVE})\n'
                    "set -- $(echo \"$resolved\" | awk '/^#/ { apt = $1 == \"#apt\"; next } apt')\n"

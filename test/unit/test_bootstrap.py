@@ -363,6 +363,15 @@ def test_the_launchs_middleware_is_what_a_machine_gets() -> None:
         planned(DEBIAN, 'auto')
 
 
+def test_ros_of_others_gets_a_middleware_and_no_upgrade() -> None:
+    under = dataclasses.replace(UNDER, rmw='rmw_cyclonedds_cpp')
+    for owned in (True, False):
+        todo = bootstrap.plan(MachineSpec('m', 'ssh', bootstrap='apt'), ROS, NOBLE, under, WHEELS,
+                              owned=owned)
+        assert 'ros-jazzy-rmw-cyclonedds-cpp' in todo.commands[0].argv[-1]
+        assert ("'ros-jazzy-*'" in todo.commands[0].argv[-1]) is owned
+
+
 def test_apt_installs_ros_on_noble_alone() -> None:
     todo = plan(NOBLE, 'apt')
     assert (todo.mode, todo.note) == ('apt', 'installed from packages')

@@ -13,7 +13,7 @@ import sys
 
 import pytest
 
-from fogros2 import plan
+from fogros2 import plan, process
 from fogros2.errors import CommandError, ConfigurationError, PrerequisiteError
 from fogros2.host import bootstrap, dependencies, installer, workspace
 from fogros2.host.inspection import HostFacts
@@ -233,6 +233,70 @@ def test_image_gets_the_debian_packages_of_keys(tmp_path: Path) -> None:
                  (tmp_path / 'apt-get.called').read_text().splitlines() if ' install ' in line]
     assert installed == ['rsync', 'fogt-hello ros-jazzy-slam-toolbox']
     assert "no rosdep rule for 'fogt_none'" in done.stderr
+
+
+#: Packages that dpkg knows: its wish, their state, their names.
+KNOWN = ('install installed ros-jazzy-rclpy', 'hold installed ros-jazzy-rcl',
+         'deinstall config-files ros-jazzy-tf2', 'install installed ros-jazzy-nav2-core')
+
+
+@pytest.mark.parametrize(('command', 'words'), [
+    # a release of ROS 2 is built together
+    (installer.apt_install(['ros-jazzy-joy', 'rsync']),
+     'ros-jazzy-joy rsync ros-jazzy-rclpy ros-jazzy-nav2-core'),
+    (installer.apt_install(['ros-jazzy-joy'], pinned=['ros-jazzy-nav2-core=1', 'rsync']),
+     'ros-jazzy-joy ros-jazzy-rclpy'),
+    (installer.apt_install(['ros-jazzy-nav2-core=1', 'ros-jazzy-rclpy=2']),
+     'ros-jazzy-nav2-core=1 ros-jazzy-rclpy=2'),
+    (installer.apt_install(['rsync', 'rosbash']), 'rsync rosbash'),
+    # on a computer of others
+    (installer.apt_install(['ros-jazzy-joy'], upgrade=False), 'ros-jazzy-joy'),
+    (installer.image_script(['ros-jazzy-joy'], []),
+     'ros-jazzy-joy ros-jazzy-rclpy ros-jazzy-nav2-core')])
+def test_packages_of_ros_are_upgraded_together(
+    tmp_path: Path, command: Command | str, words: str,
+) -> None:
+    for name, text in {'apt-get': f'echo "$*" >>{tmp_path}/calls', 'dpkg': ':', 'dpkg-query':
+                       f'[ "$4" = "ros-jazzy-*" ] && cat {tmp_path}/known'}.items():
+        (tmp_path / name).write_text(f'#!/bin/sh\n{text}\n')
+        (tmp_path / name).chmod(0o755)
+    (tmp_path / 'known').write_text('\n'.join((*KNOWN, '')))
+    script = command if isinstance(command, str) else command.argv[-1]
+    subprocess.run(['sh', '-ec', script], check=True, capture_output=True,
+                   env={'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
+    last = (tmp_path / 'calls').read_text().splitlines()[-1]
+    assert last.partition(' --no-install-recommends ')[2] == words
+
+
+@pytest.mark.parametrize(('owned', 'older'), [
+    (True, 'ros-jazzy-rclpy'), (False, 'ros-jazzy-rclpy'), (False, 'bash')])
+def test_packages_on_a_host_of_others_are_not_upgraded(
+    tmp_path: Path, owned: bool, older: str,
+) -> None:
+    (tmp_path / 'apt-get').write_text(
+        f'#!/bin/sh\n[ "$*" = "-s --with-new-pkgs upgrade" ] || exit 100\n'
+        f'echo "1 upgraded"\necho "Inst {older} [1.0] (1.1 ROS:noble)"\necho "Conf {older}"\n')
+    (tmp_path / 'apt-get').chmod(0o755)
+    scripts: list[str] = []
+    warned: list[tuple[str, str]] = []
+
+    def run(command: Command, **_: object) -> Result:
+        scripts.append(command.argv[-1])
+        if command.what == 'look for upgrades':
+            return process.run(dataclasses.replace(
+                command, environment={'PATH': f'{tmp_path}:{os.environ["PATH"]}'}), timeout=30)
+        return Result(0, 'ros-jazzy-joy\n' if command.what == 'look for apt packages' else '', '')
+
+    notes = installer.install(
+        Needs('lab', FACTS, True, ('ros-jazzy-joy',), owned=owned), run,
+        lambda text, hint: warned.append((text, hint)))
+    assert notes == ['installed ros-jazzy-joy']
+    assert any('dpkg-query -W -f' in script and ' install ' in script
+               for script in scripts) is owned
+    assert [hint for _, hint in warned] == [
+        'on the machine: sudo apt-get --with-new-pkgs upgrade'] * bool(
+            older != 'bash' and not owned)
+    assert all('such as ros-jazzy-rclpy:' in text for text, _ in warned)
 
 
 #: What apt-get prints while another process updates its lists.

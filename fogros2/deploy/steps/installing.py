@@ -35,6 +35,7 @@ def install_ros(
             job.shell, context.underlay(job.spec.workspaces), job.spec,
             timeout=context.timeouts.install, cancel=job.cancel, ready=armed, on_plan=on_plan,
             elsewhere=True, packages=context.packages, at_home=context.capabilities.account,
+            owned=context.capabilities.owned,
             warn=lambda text, hint: context.report(Warned(job.name, text, hint)))
         detail.append(note)
         return ros
