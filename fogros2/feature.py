@@ -550,13 +550,20 @@ def installed() -> dict[str, Feature]:
     return {name: load(name) for name in plugin_system.names(GROUP)}
 
 
-def tables() -> dict[str, Feature]:
-    """
-    Return the features with a table in ``ros2 fog status``, by name.
+def loadable(warn: Callable[[str], object] = lambda text: None) -> dict[str, Feature]:
+    """Return the features that can be loaded, by name; warn of the others."""
+    features = {}
+    for name in plugin_system.names(GROUP):
+        try:
+            features[name] = load(name)
+        except Exception as error:  # noqa: BLE001 - a defective feature must not end the others
+            warn(f'{name}: {plugin_system.cause(error)}')
+    return features
 
-    :raises PrerequisiteError: one cannot be loaded.
-    """
-    return {name: each for name, each in installed().items() if each.headings}
+
+def tables(warn: Callable[[str], object] = lambda text: None) -> dict[str, Feature]:
+    """Return the features with a table in ``ros2 fog status``, by name; see ``loadable``."""
+    return {name: each for name, each in loadable(warn).items() if each.headings}
 
 
 def options(name: str, given: Mapping[str, Any], of: str = 'options') -> Any:

@@ -188,9 +188,13 @@ class Entry:
         }
 
 
-def notes() -> dict[str, str]:
-    """Return what features may note of machines, each with its line for ``ros2 fog list``."""
-    return {key: line for each in feature.installed().values()
+def notes(warn: Warn = lambda text: None) -> dict[str, str]:
+    """
+    Return what features may note of machines, each with its line for ``ros2 fog list``.
+
+    :param warn: takes a line about each feature that cannot be loaded.
+    """
+    return {key: line for each in feature.loadable(warn).values()
             for key, line in each.notes.items()}
 
 

@@ -36,6 +36,8 @@ class ListVerb(VerbExtension):
             others = {name: one or ([], '') for name, one in zip(names, asked.result())}
         now = time.time()
         if args.json:
+            if entries:
+                machines.notes(warn)  # entries have no notes of features that cannot be loaded
             print_json(machines=[entry.to_json(now) for entry in entries],
                        **{name: rows for name, (rows, _) in others.items()})
             return 0
@@ -54,13 +56,13 @@ class ListVerb(VerbExtension):
               table.cost(entry.cost), table.cost(entry.spent(now), 2)) for entry in entries],
             width=table.terminal_width(),
             optional=('KIND', 'PLACE', 'ADDRESS', 'COST', 'AGE', 'COST/H', 'PROVIDER')))
-        for entry in entries:
-            # all features are loaded for their lines, which takes long
-            if entry.record is not None and entry.record.notes:
-                for key, line in machines.notes().items():
-                    if line and entry.notes[key]:
-                        print(f'{entry.name}:',
-                              line.format(name=entry.name, note=entry.notes[key]))
+        noted = [entry for entry in entries if entry.record is not None and entry.record.notes]
+        # all features are loaded for their lines, which takes long
+        lines = machines.notes(warn) if noted else {}
+        for entry in noted:
+            for key, line in lines.items():
+                if line and entry.notes[key]:
+                    print(f'{entry.name}:', line.format(name=entry.name, note=entry.notes[key]))
         total = machines.total(entries, now)
         if total is not None:
             unknown = sum(entry.runs and entry.cost is None for entry in entries)

@@ -50,7 +50,7 @@ class StatusVerb(VerbExtension):
             return show_link(reach.measure(
                 other.interface.address, other.own, other.machine.public_key), as_json=args.json)
         entry = reach.find(args.name, warn, regions=args.region)
-        tables = feature.tables()
+        tables = feature.tables(warn)
         status: dict[str, Any] = {**entry.to_json(), 'vpn': None, 'clock': None, 'agent': None,
                                   'streams': [], 'features': [],
                                   **{name: [] for name in tables}}

@@ -22,7 +22,7 @@ from unittest.mock import Mock
 import pytest
 from ros2cli.cli import main
 
-from fogros2 import process, report, ros2_daemon
+from fogros2 import feature, process, report, ros2_daemon
 from fogros2.deploy import undo
 from fogros2.errors import (
     ConnectError,
@@ -210,6 +210,24 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert entry['launch_alive'] is True and entry['cost_per_hour'] == 0.5
     assert entry['cost'] == pytest.approx(0.5 / 6, rel=0.01)
     assert 595 < entry['age'] < 700 and 3500 < entry['time_left'] < 3600
+
+
+@pytest.mark.parametrize('words', [('list',), ('list', '--json'), ('status', 'a', '--json')])
+def test_feature_that_does_not_load_ends_no_view(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Sums(feature.Feature):
+        notes = {'sum': '{note} apples'}
+        headings = ('APPLES',)
+
+    instead(monkeypatch, 'fogros2.feature', {
+        'old': PrerequisiteError("the feature 'old' can't be loaded"), 'sums': Sums})
+    machine('a')
+    record('a', **alive(), notes={'sum': '7'})
+    run(*words)
+    shown = capsys.readouterr()
+    assert ('a: 7 apples' if len(words) == 1 else '"sum": "7"') in shown.out
+    assert shown.err.count("old: the feature 'old' can't be loaded\n") == 1
 
 
 def test_region_is_passed_to_providers_with_regions(capsys: pytest.CaptureFixture[str]) -> None:
