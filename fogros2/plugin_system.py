@@ -65,7 +65,8 @@ def load(group: str, name: str) -> Any:
         # a module of an unknown package may have another name than its project
         remedy = f'python3 -m pip install {module if own else f"--upgrade {dist}"}'
         if module.partition('.')[0] in own_packages():
-            remedy = 'install FogROS2 again from the folder that it came from' if own else \
+            remedy = ('install FogROS2 again from the folder that it came from; in a workspace, '
+                      'delete build/fogros2 and install/fogros2 before') if own else \
                 f'install a version of {dist} that is for this version of FogROS2'
         raise PrerequisiteError(
             f"the {_kind(group)} '{name}' can't be loaded: {error}", remedy) from error

@@ -7,6 +7,8 @@ import os
 import sys
 import threading
 import time
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -80,6 +82,15 @@ def test_defective_plugin_is_named(tmp_path, monkeypatch, program, message, hint
     with pytest.raises(errors.PrerequisiteError, match=message) as caught:
         plugin_system.load('fogros2.feature', 'shelf')
     assert hint in caught.value.hint and 'install FogROS2' not in caught.value.hint
+
+
+def test_verb_of_a_former_version_in_a_workspace_has_a_remedy(monkeypatch):
+    error = ImportError("No module named 'fogros2.former'", name='fogros2.former')
+    point = SimpleNamespace(load=Mock(side_effect=error), dist=SimpleNamespace(name='fogros2'))
+    monkeypatch.setattr(plugin_system, '_entry_points', lambda group: {'former': point})
+    with pytest.raises(errors.PrerequisiteError) as caught:
+        plugin_system.load('fogros2.verb', 'former')
+    assert 'delete build/fogros2 and install/fogros2 before' in caught.value.hint
 
 
 def test_first_of_two_plugins_with_one_name_wins(monkeypatch):
