@@ -328,7 +328,8 @@ def plan(
     elif mode == 'pip':
         raise PrerequisiteError(
             f"{machine} can't get ROS 2 by pip: {no_pip}",
-            'make room there' if 'are free' in no_pip else
+            f'make room there: {facts.home}/{INSTALL_FOLDER} has what former launches installed'
+            if 'are free' in no_pip else
             "bootstrap='auto' takes another way where there is one")
     elif not no_apt:
         todo = _apt(facts, wheels, chain, (*apt_packages(under.rmw), *spec.apt), owned)
