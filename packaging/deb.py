@@ -97,14 +97,14 @@ dpkg -L ros-jazzy-fogros2 | sed -n 's/\\.py$//p' | while read -r module; do
     rmdir --ignore-fail-on-non-empty -- "$folder"
 done
 """
-#: A group without members: an administrator says who may.
+#: A group without members: an administrator says who may, and may mask the timer.
 POSTINST = f"""\
 #!/bin/sh
 set -e
 getent group fogros2 >/dev/null || groupadd --system fogros2
 if [ -d /run/systemd/system ]; then
-    systemctl daemon-reload
-    systemctl start --quiet {TIMER}
+    systemctl daemon-reload || :
+    systemctl start --quiet {TIMER} || :
 fi
 """
 POSTRM = """\

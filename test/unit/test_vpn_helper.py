@@ -355,19 +355,34 @@ def test_interface_that_goes_while_down_waits_is_no_error(
     vpn.down({'name': folder.name}, 1000)
 
 
-def test_package_is_removed_while_another_user_has_an_interface(tmp_path: Path) -> None:
-    """``sudo apt purge`` names the administrator; nor does a refusal end the script."""
+def deb() -> Any:
     spec = importlib.util.spec_from_file_location('deb', FOLDER.parent / 'deb.py')
     assert spec and spec.loader
-    deb = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(deb)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_package_is_installed_although_its_timer_is_masked(tmp_path: Path) -> None:
+    for name, text in {'getent': 'exit 0', 'systemctl': f'echo "$1" >>{tmp_path}/ran; exit 1'
+                       }.items():
+        (tmp_path / name).write_text(f'#!/bin/sh\n{text}\n')
+        (tmp_path / name).chmod(0o755)
+    text = deb().POSTINST.replace('/run/systemd/system', str(tmp_path))
+    subprocess.run(['sh', '-c', text, 'postinst', 'configure'], check=True,
+                   env={'PATH': f'{tmp_path}:{os.environ["PATH"]}'})
+    assert (tmp_path / 'ran').read_text().split() == ['daemon-reload', 'start']
+
+
+def test_package_is_removed_while_another_user_has_an_interface(tmp_path: Path) -> None:
+    """``sudo apt purge`` names the administrator; nor does a refusal end the script."""
     helper = tmp_path / 'vpn'
     helper.write_text(f'#!/bin/sh\necho "$(cat) ${{SUDO_UID-root}}" >>{tmp_path}/said; exit 2\n')
     helper.chmod(0o755)
     records = tmp_path / 'run/fogros2-vpn'
     for name in ('fog0a1b2c', 'fog0a1b2d'):
         (records / name).mkdir(parents=True)
-    text = deb.PRERM.replace('/run/', f'{tmp_path}/run/').replace(helped.HELPER, str(helper))
+    text = deb().PRERM.replace('/run/', f'{tmp_path}/run/').replace(helped.HELPER, str(helper))
     subprocess.run(['sh', '-c', text, 'prerm', 'remove'], check=True, stderr=subprocess.DEVNULL,
                    env={**os.environ, 'SUDO_UID': '1000'})
     assert (tmp_path / 'said').read_text().splitlines() == [
