@@ -223,7 +223,7 @@ def test_feature_that_does_not_load_ends_no_view(
     instead(monkeypatch, 'fogros2.feature', {
         'old': PrerequisiteError("the feature 'old' can't be loaded"), 'sums': Sums})
     machine('a')
-    record('a', **alive(), notes={'sum': '7'})
+    record('a', **this_process(), notes={'sum': '7'})
     run(*words)
     shown = capsys.readouterr()
     assert ('a: 7 apples' if len(words) == 1 else '"sum": "7"') in shown.out
