@@ -382,7 +382,8 @@ class Agent:
             if not self.ending:
                 self._watch()
                 until = self.watchdog.deadlines()[0][0]
-            self.loop.turn(until)
+            if not self.done:  # without nodes and watches, there is nothing to wait for
+                self.loop.turn(until)
         for client in list(self.clients):
             client.close()
 

@@ -492,6 +492,11 @@ def test_computer_without_end_command_is_cleaned_up(rig):
     assert mark.exists() and not rig.directory.exists()
 
 
+def test_agent_without_nodes_and_clients_leaves_at_once(rig):
+    assert rig.serve(boot_timeout=0.5).wait(30) == 0
+    assert not rig.directory.exists()
+
+
 def test_kept_machine_without_launch_outlives_its_agent(rig):
     client = rig.started(on_exit='keep', lifetime=3.0, end_command=ends(rig))
     client.request('release', on_exit='keep')
