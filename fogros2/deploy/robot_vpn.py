@@ -19,7 +19,8 @@ from fogros2.report import Event, Reporter, step, StepFailed
 from fogros2.vpn import addresses, helped, owner, Vpn
 from fogros2.waiting import Periodic
 
-#: Seconds between two refreshes of sudo's ticket, which is valid for some minutes.
+#: Seconds between two refreshes of sudo's ticket, which is valid for some minutes, and between
+#: two looks at the packet filter, which need root.
 TICKET_REFRESH = 120.0
 #: Seconds that a new machine waits for the others to add it as a peer.
 UPDATE_TIMEOUT = 5.0
@@ -217,21 +218,25 @@ class RobotVpn:
 
     def check_health(self) -> float:
         """
-        Restart the interface's program if it has ended; nodes do not notice.
+        Repair the interface if its program has ended or its filter is gone; nodes do not notice.
 
         Return the seconds until the next check; a lasting failure is reported once.
         """
-        if self._ticket and time.monotonic() - self._ticket_refreshed > TICKET_REFRESH:
+        checks = [self.vpn.health_check(self.interface)]
+        if time.monotonic() - self._ticket_refreshed > TICKET_REFRESH:
             self._ticket_refreshed = time.monotonic()
-            self._refresh_ticket()
+            if self._ticket:
+                self._refresh_ticket()
+            if self.helped or self._ticket_valid:
+                checks.append(self.vpn.status(self.interface))
         with self._lock:
             if self._stop.is_set() or self._ending.is_set():
                 return self._poll_interval  # the networks that lead to the machines end with them
             self._poll_interval = min(2 * self._poll_interval, LONGEST_POLL_INTERVAL)
             reports: list[Event] = []
             try:
-                if process.run(self.vpn.health_check(self.interface), check=False,
-                               timeout=self._timeout).returncode != 0:
+                if any(process.run(check, check=False, timeout=self._timeout).returncode != 0
+                       for check in checks):
                     with step(reports.append, '', 'VPN repair', fatal=False):
                         self._run(self.vpn.repair(self.interface, self._peers()), cancel=False)
                         self._note_owner()

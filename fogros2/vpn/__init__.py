@@ -59,7 +59,7 @@ class Vpn(abc.ABC):
 
     @abc.abstractmethod
     def status(self, interface: VpnInterface) -> Command:
-        """Return the command whose output ``parse_status`` reads."""
+        """Return the command whose output ``parse_status`` reads; it fails without a filter."""
 
     @abc.abstractmethod
     def parse_status(self, output: str) -> dict[str, dict[str, float]]:

@@ -120,7 +120,8 @@ class WireGuard(Vpn):
         ``wireguard-go`` would use the old address for 15 s, and ``repair`` makes it look again.
         Networks that lead to no peer may come and go. A machine notes its peers' endpoints for
         ``repair``: without them it could not reach a robot behind NAT, which would notice the lost
-        session only after 15 s.
+        session only after 15 s. On a machine the check also fails without the filter, which other
+        programs may delete (``nft flush ruleset``); the robot looks for its own by ``status``.
         """
         name, noted = _name(interface), _noted(interface)
         lines = [
@@ -130,6 +131,7 @@ class WireGuard(Vpn):
             lines.append(f'[ ! -e {noted} ] || {{ read -r _ before; '
                          f'set -- $({_FROM}); [ "$*" = "$before" ]; }} <{noted}')
         else:
+            lines += [_PATH, _look(name)]
             lines.append(f'found=$(wg show {name} endpoints) && '
                          f'{{ [ "$found" = "$(cat {noted} 2>/dev/null)" ] || '
                          f'printf "%s\\n" "$found" >{noted}; }} || :')
@@ -149,11 +151,15 @@ class WireGuard(Vpn):
         yield self._script(interface, peers, _what('repair', interface), recall=True)
 
     def status(self, interface: VpnInterface) -> Command:
-        """Return a command that prints only counters: ``dump`` would print the private key."""
+        """
+        Return a command that prints only counters: ``dump`` would print the private key.
+
+        The command fails without the filter, too.
+        """
         name = _name(interface)
         return Command.script(
-            f'wg show {name} latest-handshakes; wg show {name} transfer', sudo=True,
-            what=_what('ask', interface, 'for its counters'))
+            f'{_PATH}\nwg show {name} latest-handshakes; wg show {name} transfer\n{_look(name)}',
+            sudo=True, what=_what('ask', interface, 'for its counters'))
 
     def parse_status(self, output: str) -> dict[str, dict[str, float]]:
         """
@@ -224,6 +230,12 @@ def _name(interface: VpnInterface) -> str:
         raise ConfigurationError(
             f"'{name}' can't name a VPN interface", f'at most {MAX_NAME} letters and digits')
     return name
+
+
+def _look(name: str) -> str:
+    """Return the text that fails if an interface's filter does not exist."""
+    return (f'nft list table inet {name} >/dev/null 2>&1 || '
+            f'{{ echo "the packet filter of {name} is missing" >&2; exit 1; }}')
 
 
 def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:

@@ -178,6 +178,13 @@ def test_a_user_makes_changes_and_takes_away_an_interface(copy: Copy) -> None:
         again = copy.ask('fogada', 'repair', name=NAME, peers=[peer('198.18.7.2')])
         assert again.returncode == 0, again.stderr
         assert copy.ask('fogada', 'status', name=NAME).stdout.count(KEY) == 2
+        # another program deletes the filter
+        copy.run('root', 'nft', 'flush', 'ruleset', check=True)
+        said = copy.ask('fogada', 'status', name=NAME)
+        assert said.returncode == 1 and 'filter' in said.stderr, said
+        again = copy.ask('fogada', 'repair', name=NAME, peers=[peer('198.18.7.2')])
+        assert again.returncode == 0, again.stderr
+        assert copy.ask('fogada', 'status', name=NAME).returncode == 0
         # the private key is root's alone, and so is the folder of the records
         assert copy.run('fogada', 'cat', f'/run/fogros2-vpn/{NAME}/key').returncode != 0
         assert copy.run('fogada', 'touch', '/run/fogros2-vpn/x').returncode != 0

@@ -765,8 +765,29 @@ def test_sudo_that_fails_once_ends_no_health_check(launch, events, monkeypatch, 
     monkeypatch.setattr(process, 'sudo_trouble', slow)
     monkeypatch.setattr(process, 'run', lambda *_, **__: looked.append(1) or Result(0, '', ''))
     robot._ticket, robot._ticket_refreshed = True, -1e9
-    assert robot.check_health() == robot_vpn.POLL_INTERVAL and looked == [1]
+    assert robot.check_health() == robot_vpn.POLL_INTERVAL and looked == [1, 1]
     assert not [event for event in events if isinstance(event, StepFailed)]
+
+
+@pytest.mark.parametrize(('helped', 'ticket', 'repaired'), [
+    (False, True, True), (True, False, True), (False, False, False)])
+def test_lost_filter_of_the_robot_is_repaired(launch, monkeypatch, helped, ticket, repaired):
+    """Somebody has run ``nft flush ruleset``; only root, or the helper for it, can see that."""
+    calls = []
+
+    def run(command, **arguments):
+        calls.append(command.what)
+        return Result(int(command.what == 'status'), '', 'the packet filter is missing')
+
+    robot = launch.robot_vpn()
+    monkeypatch.setattr(process, 'run', run)
+    monkeypatch.setattr(process, 'sudo_trouble', lambda: None if ticket else process.PASSWORD)
+    robot.helped, robot._ticket = helped, not helped
+    robot.check_health()
+    assert 'repair' not in calls, 'not at each look'
+    robot._ticket_refreshed = -1e9
+    robot.check_health()
+    assert ('repair' in calls) == ('status' in calls) == repaired
 
 
 def test_interface_does_not_come_up_after_the_end(launch, monkeypatch):

@@ -283,6 +283,23 @@ def test_a_hijacked_machine_reaches_dds_and_ping_alone(vpn: Lab) -> None:
     assert sorted(reached()) == sorted(targets)
 
 
+def test_flushed_filter_is_noticed_and_repaired(vpn: Lab) -> None:
+    """As ``systemctl reload nftables`` flushes it on Debian and Ubuntu."""
+    def complete(host: str) -> bool:
+        return vpn.alive(host) and vpn.run(
+            host, vpn.vpn.status(vpn.interfaces[host]), check=False).returncode == 0
+
+    for host, interface in vpn.interfaces.items():
+        assert complete(host)
+        vpn.shell(host, 'nft flush ruleset')
+        assert not complete(host)
+        vpn.repair(host)
+        assert complete(host)
+        assert f'table inet {interface.name}' in vpn.shell(host, 'nft list tables')
+    vpn.shell('machine', 'nft flush ruleset')
+    assert not vpn.alive('machine'), 'its agent looks each second'
+
+
 def test_machine_with_an_address_of_the_vpn_is_reported(lab: Lab) -> None:
     interface = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
     peers = lab.peers()['machine']
