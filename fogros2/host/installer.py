@@ -177,8 +177,10 @@ python3 -m pip --version || ls "$VIRTUAL_ENV"/../wheels/pip-*.whl ||
     python3 -c 'import ensurepip, venv'
 """
 #: Enters a folder while no other launch installs; exits with 0 if another one has completed it.
+#: The user's pip.conf may ask for ``--user`` or a virtual environment, and pip refuses them here.
 ENTER = """\
 set -e
+export PIP_USER=0 PIP_REQUIRE_VIRTUALENV=0
 mkdir -p {folder}
 before=$(umask)
 umask 077  # another account that may read the file could lock it

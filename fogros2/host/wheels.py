@@ -166,7 +166,8 @@ def fetch(
                 '--python-version', version, '--implementation', 'cp', '--abi', f'cp{version}',
                 '--abi', 'abi3', '--abi', 'none',
                 *(word for one in _PLATFORMS for word in ('--platform', one)),
-                '--requirement', file.name), what='fetch ROS 2 for a machine'),
+                '--requirement', file.name), what='fetch ROS 2 for a machine',
+                environment={'PIP_REQUIRE_VIRTUALENV': '0'}),
                 timeout=timeout, cancel=cancel)
         except CommandError as error:
             raise PrerequisiteError(

@@ -100,9 +100,14 @@ def installed(
     """
     Install wheels as on a machine, with this interpreter as that of the nodes.
 
+    The user's pip.conf there has what developers have on their own computers.
+
     :param system: a folder with packages that the machine has.
     """
+    (tmp_path / 'pip.conf').write_text(
+        '[global]\nrequire-virtualenv = true\n[install]\nuser = true\n')
     needs = Needs('a', HostFacts(home=str(tmp_path)), True, pip=names, environment={
+        'PIP_CONFIG_FILE': str(tmp_path / 'pip.conf'),
         'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}', 'PYTHONPATH': system,
         'PIP_NO_INDEX': '1', 'PIP_FIND_LINKS': str(tmp_path)})
     return needs.folder, completed(fill(needs, names))

@@ -150,6 +150,14 @@ def test_workspace_with_fogros2_needs_no_wheel(tmp_path):
         f'{root}/install/fogros2:/opt/ros/jazzy')
 
 
+def test_fetching_needs_no_virtual_environment(tmp_path, monkeypatch):
+    """Which the user's pip.conf may ask for."""
+    commands = []
+    monkeypatch.setattr(wheels.process, 'run', lambda command, **_: commands.append(command))
+    wheels.fetch(['numpy'], (3, 13), timeout=60.0, folder=tmp_path)
+    assert [command.environment['PIP_REQUIRE_VIRTUALENV'] for command in commands] == ['0']
+
+
 def test_fetching_ends_when_the_launch_does(tmp_path, monkeypatch):
     pip = tmp_path / 'python'
     pip.write_text('#!/bin/sh\nexec sleep 100\n')
