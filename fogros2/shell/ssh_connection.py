@@ -363,15 +363,14 @@ def _keys(settings: Settings, name: str, locked: list[str]) -> Iterator[paramiko
         try:
             yield load_key(path, name)
         except AuthenticationError as error:
-            if not isinstance(error.__cause__, paramiko.PasswordRequiredException):
-                if len(files) == 1 and settings.only_keys:
-                    raise
-                continue
+            # the file may also be the public half, or missing beside it
             held = _agent_keys(settings.agent) if settings.only_keys else {}
             if _public(path) in held:
                 yield held[_public(path)]
-            else:
+            elif isinstance(error.__cause__, paramiko.PasswordRequiredException):
                 locked.append(str(path))
+            elif len(files) == 1 and settings.only_keys:
+                raise
 
 
 def _agent_keys(socket_path: str) -> dict[str, paramiko.AgentKey]:
@@ -395,9 +394,10 @@ def _agent_keys(socket_path: str) -> dict[str, paramiko.AgentKey]:
 
 
 def _public(path: Path) -> str:
-    """Return the base64 of a private key's public file, '' without one."""
+    """Return the base64 of a private key's public file, or of a public one; '' without one."""
+    file = path if path.suffix == '.pub' else path.with_name(f'{path.name}.pub')
     try:
-        return path.with_name(f'{path.name}.pub').read_text().split()[1]
+        return file.read_text().split()[1]
     except (OSError, ValueError, IndexError):
         return ''
 

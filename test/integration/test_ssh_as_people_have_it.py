@@ -250,6 +250,20 @@ def test_key_with_a_passphrase_comes_from_the_agent(server, home, agent):
         server.endpoint, key_file=str(path)), name='planner')) == 'hello\n'
 
 
+@pytest.mark.parametrize('named', ['key', 'key.pub'])
+@pytest.mark.parametrize('more', ['', '  IdentitiesOnly yes\n'])
+def test_key_that_only_the_agent_has_is_named_by_its_public_half(
+        server, home, agent, named, more):
+    """As documents of password managers, hardware keys and forwarded agents tell users."""
+    add(*(keygen(home / f'other{number}') for number in range(7)), server.folder / 'id')
+    (home / 'key.pub').write_text((server.folder / 'id.pub').read_text())
+    configured(home, server, more)
+    (home / '.ssh/config').write_text((home / '.ssh/config').read_text().replace(
+        f'IdentityFile {server.folder}/id', f'IdentityFile {home}/{named}'))
+    assert openssh(home) == ''
+    assert says(SSHShell(computer('lab'), name='planner')) == 'hello\n'
+
+
 def test_too_many_keys_of_the_agent_are_named(server, home, agent):
     add(*(keygen(home / f'other{number}') for number in range(7)))
     (home / '.ssh/id_ed25519').write_text((server.folder / 'id').read_text())
