@@ -41,9 +41,11 @@ until
     done
     # the installation shows whether a source is missed
     printf '%s\\n' "$output" >&2
-    # repair an installation that was killed; apt waits for one that still runs
-    dpkg --configure -a </dev/null || :
-    apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends {packages}
+    # repair an installation that was killed; apt waits for one that still runs. dpkg itself asks
+    # about configuration files that the administrator has changed: they stay
+    dpkg --force-confdef --force-confold --configure -a </dev/null || :
+    apt-get -qy -o DPkg::Lock::Timeout=300 -o Dpkg::Options::=--force-confdef \\
+        -o Dpkg::Options::=--force-confold install --no-install-recommends {packages}
 do
     # 'update' exits with 0 without a network, which may need some seconds after the boot
     why=$(printf '%s\\n' "$output" | grep -E \\

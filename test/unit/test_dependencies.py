@@ -337,6 +337,48 @@ def test_apt_waits_for_its_lists_and_a_gone_source_is_no_error(
     assert lines[-1].endswith(' install --no-install-recommends wireguard-tools rsync nftables')
     shown = log.read_text() if log.exists() else done.stderr
     assert (said in shown) is (said == GONE)
+    assert {'Dpkg::Options::=--force-confdef', 'Dpkg::Options::=--force-confold'} <= {
+        *lines[-1].split()}, 'dpkg asks, and nobody answers'
+
+
+@pytest.mark.skipif(shutil.which('dpkg-deb') is None or os.geteuid() != 0,
+                    reason='needs dpkg, and root to install')
+def test_changed_configuration_file_of_a_host_stays(tmp_path: Path) -> None:
+    """Such as /etc/sudoers: a new version asks, and without an answer stays half-configured."""
+    root = tmp_path / 'root'
+    for name in ('status', 'available'):
+        (root / 'var/lib/dpkg/info').mkdir(parents=True, exist_ok=True)
+        (root / 'var/lib/dpkg' / name).touch()
+    (root / 'var/lib/dpkg/updates').mkdir()
+    dpkg = ['dpkg', f'--root={root}', '--force-depends', '--log=/dev/null']
+
+    def unpack(version: str) -> None:
+        folder = tmp_path / version
+        (folder / 'DEBIAN').mkdir(parents=True)
+        (folder / 'etc').mkdir()
+        (folder / 'etc/fogt.conf').write_text(f'of version {version}\n')
+        (folder / 'DEBIAN/conffiles').write_text('/etc/fogt.conf\n')
+        (folder / 'DEBIAN/control').write_text(
+            f'Package: fogt-conf\nVersion: {version}\nArchitecture: all\n'
+            'Maintainer: fog <fog@example.com>\nDescription: nothing\n')
+        subprocess.run(['dpkg-deb', '-b', folder, tmp_path / 'deb'], check=True,
+                       stdout=subprocess.DEVNULL)
+        subprocess.run([*dpkg, '--unpack', tmp_path / 'deb'], check=True,
+                       stdout=subprocess.DEVNULL)
+
+    unpack('1')
+    subprocess.run([*dpkg, '--configure', '-a'], check=True, stdout=subprocess.DEVNULL)
+    (root / 'etc/fogt.conf').write_text('of the administrator\n')
+    unpack('2')
+    repair, = (line for line in installer.APT.splitlines() if ' --configure -a' in line)
+    done = subprocess.run(
+        ['sh', '-c', f'{repair.replace("dpkg ", " ".join(dpkg) + " ")}; exit 0'],
+        capture_output=True, text=True)
+    assert 'Keeping old config file as default' in done.stderr
+    assert (root / 'etc/fogt.conf').read_text() == 'of the administrator\n'
+    state = subprocess.run(['dpkg-query', f'--admindir={root}/var/lib/dpkg', '-W', '-f',
+                            '${db:Status-Status}', 'fogt-conf'], capture_output=True, text=True)
+    assert state.stdout == 'installed'
 
 
 OFFLINE = "W: Failed to fetch http://192.0.2.1/dists Temporary failure resolving '192.0.2.1'"

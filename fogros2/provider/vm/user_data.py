@@ -101,7 +101,8 @@ until output=$(LC_ALL=C apt-get -q update 2>&1); do
     sleep 1
 done
 echo "$output"
-apt-get -qy -o DPkg::Lock::Timeout=300 install --no-install-recommends \\
+apt-get -qy -o DPkg::Lock::Timeout=300 -o Dpkg::Options::=--force-confdef \\
+    -o Dpkg::Options::=--force-confold install --no-install-recommends \\
     wireguard-tools rsync nftables
 } >/var/log/fogros2-tools.log 2>&1 </dev/null &
 """
