@@ -432,7 +432,8 @@ def _build(workspace: Workspace, ros_setup: Sequence[str]) -> Command:
     below = 'src' if (workspace.root / 'src').is_dir() else '.'
     source = ''.join(f'. {shlex.quote(script)}\n' for script in ros_setup)
     return Command.script(
-        f'{source}cd {root}\nbelow={below}\n{_CLEAN}'
+        # the user's own defaults on that computer may put the packages elsewhere
+        f'{source}export COLCON_DEFAULTS_FILE=/dev/null\ncd {root}\nbelow={below}\n{_CLEAN}'
         # each compiler needs gigabytes of memory
         f'colcon build --base-paths {below} --parallel-workers "$(nproc)" '
         '--event-handlers console_cohesion+ --cmake-args -DCMAKE_BUILD_TYPE=Release\n',

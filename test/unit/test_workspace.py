@@ -299,8 +299,10 @@ def test_machine_that_builds_drops_removed_packages(root: Path, tmp_path: Path) 
         write(root / 'install' / name / 'share/colcon-core/packages' / name)
         write(root / 'build' / name / 'made')
     write(root / 'install/other/file')
+    # the defaults of a user there may name an install space of his own
     write(tmp_path / 'bin/colcon',
-          '#!/bin/sh\n[ "$3" != list ] || printf "alpha\\nbeta\\n"\n', 0o755)
+          '#!/bin/sh\n[ "$COLCON_DEFAULTS_FILE" = /dev/null ] || exit 1\n'
+          '[ "$3" != list ] || printf "alpha\\nbeta\\n"\n', 0o755)
     build, = way.commands
     subprocess.run(build.argv, check=True,
                    env={'PATH': f"{tmp_path / 'bin'}:{os.environ['PATH']}"})
