@@ -98,6 +98,9 @@ def test_a_machine_has_its_own_name_address_users_and_processes(one):
     assert said(shell, 'pwd') == '/home/fog'
     assert len(said(shell, 'ps', '-e', '-o', 'pid=').splitlines()) < 12
     assert said(shell, 'printenv', 'LANG') == 'C.UTF-8'
+    # half of the memory, as on other computers, not 64 MB
+    shared = int(said(shell, 'df', '--output=size', '/dev/shm').split()[-1]) << 10
+    assert shared > 0.4 * os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE')
 
 
 def test_nothing_of_this_computer_s_own_is_seen(one, tmp_path):

@@ -151,8 +151,12 @@ def test_a_pod_has_net_admin_and_no_other_right():
     assert container['securityContext']['capabilities'] == {'add': ['NET_ADMIN']}
     assert container['securityContext']['privileged'] is False
     assert pod['automountServiceAccountToken'] is False
-    for word in ('hostNetwork', 'hostPID', 'hostIPC', 'volumes'):
+    for word in ('hostNetwork', 'hostPID', 'hostIPC'):
         assert word not in pod
+    # not the 64 MB of the runtimes
+    volume, = pod['volumes']
+    assert volume == {'name': volume['name'], 'emptyDir': {'medium': 'Memory'}}
+    assert container['volumeMounts'] == [{'name': volume['name'], 'mountPath': '/dev/shm'}]
     assert container['imagePullPolicy'] == 'IfNotPresent'
     # nothing secret in what everybody in the namespace can read
     assert REQUEST.token not in json.dumps(pod)

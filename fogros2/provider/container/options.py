@@ -150,6 +150,8 @@ def common_flags(
         # Only the machine's name, not the names in this computer's /etc/hosts, as docker does it.
         yield '--no-hosts'
     yield from container_engine.limits()
+    # as on every other computer, half of the memory: the engines' 64 MB end nodes by SIGBUS
+    yield from ('--shm-size', str(os.sysconf('SC_PHYS_PAGES') // 2 * os.sysconf('SC_PAGE_SIZE')))
     if options.network:
         yield from ('--network', options.network)
     if options.cpus:

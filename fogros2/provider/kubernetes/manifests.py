@@ -21,6 +21,8 @@ BOOT = 600.0
 APPLICATION_PORT = 8080
 #: Limits of the application, a file server, if the machine's container has limits of that kind.
 _APPLICATION_LIMITS = {'cpu': '100m', 'memory': '128Mi'}
+#: Name of a pod's volume at /dev/shm.
+_SHM = 'fogros2-shm'
 #: A mesh adds no container, which would outlive the machine; Istio's label, before an annotation.
 _NO_MESH = {'sidecar.istio.io/inject': 'false'}
 
@@ -90,8 +92,10 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
         'restartPolicy': 'Never', 'automountServiceAccountToken': False,
         'enableServiceLinks': False, 'hostname': names.job_name(spec.name)[len('fogros2-'):],
         'terminationGracePeriodSeconds': boot.GRACE, 'containers': [container]}
-    if request.with_volumes:
-        manifest['volumes'], container['volumeMounts'] = claims.mounts(request.with_volumes)
+    manifest['volumes'], container['volumeMounts'] = claims.mounts(request.with_volumes)
+    # runtimes give 64 MB, which end nodes by SIGBUS; what is used counts to the pod's memory
+    manifest['volumes'].append({'name': _SHM, 'emptyDir': {'medium': 'Memory'}})
+    container['volumeMounts'].append({'name': _SHM, 'mountPath': '/dev/shm'})  # noqa: S108
     if request.application:
         manifest['containers'].append(_application(request.application, resources))
     if options.node_selector:
