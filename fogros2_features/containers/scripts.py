@@ -74,10 +74,12 @@ if [ -n "$rmw" ]; then
 fi
 echo "$image"
 """
-# Docker takes a number of GPUs, podman the name of each by the vendor's description (CDI).
+# Docker takes a number of GPUs, podman the name of each by the vendor's description (CDI). Of
+# docker, an image that names no capabilities gets neither video encoders nor graphics.
 GPUS = """\
 if [ -n "$gpus" ]; then
-    if [ $engine = docker ]; then set -- --gpus "$gpus" "$@"
+    if [ $engine = docker ]; then
+        set -- --gpus "$gpus" -e NVIDIA_DRIVER_CAPABILITIES=all "$@"
     else
         case $gpus in
             *[!0-9]*) set -- --device "nvidia.com/gpu=$gpus" "$@" ;;

@@ -534,7 +534,8 @@ def test_a_node_gets_its_gpus_and_nothing_is_downloaded_for_it(engine, tmp_path)
     lines = (tmp_path / 'notes.variables').read_text().splitlines()
     # the image's own values do not remain
     assert {'RMW_IMPLEMENTATION=rmw', 'ROS_DOMAIN_ID=0', 'ROS_DISCOVERY_SERVER='} < {*lines}
-    gpus = '--gpus all' if engine == 'docker' else '--device nvidia.com/gpu=all'
+    gpus = ('--gpus all -e NVIDIA_DRIVER_CAPABILITIES=all' if engine == 'docker'
+            else '--device nvidia.com/gpu=all')
     (create,) = (line for line in told if ' create ' in line)
     assert f' {gpus} ' in create and f' -v {tmp_path}:{tmp_path}:ro ' in create
     for option in ('--pull never', '--network host', '--ipc host', f'--user {os.getuid()}:'):
@@ -586,8 +587,8 @@ def test_signal_reaches_the_node_below_an_init_or_entry_point(tmp_path, first):
 def test_gpu_options_are_those_of_the_engine(engine, number, names):
     container = parse(f'docker run --gpus {number} -p 80:80 image run')
     told = done(containers.run(container, 0, 'abc', 'image', '/run/dds.xml', '/run/variables'))[1]
-    gpus = f'--gpus {number}' if engine == 'docker' else ' '.join(
-        f'--device nvidia.com/gpu={name}' for name in names)
+    gpus = (f'--gpus {number} -e NVIDIA_DRIVER_CAPABILITIES=all' if engine == 'docker'
+            else ' '.join(f'--device nvidia.com/gpu={name}' for name in names))
     assert told[-1] == (f'{engine} run -d --name fogros2-abc-0-image {gpus} '
                         '--label fogros2-launch=abc -p 80:80 image run')
 

@@ -240,7 +240,8 @@ def test_options_are_taken_as_they_are_meant(tmp_path):
 
 
 @pytest.mark.parametrize(('engine', 'gpus', 'flags'), [
-    ('docker', 'all', '--gpus all'), ('docker', '2', '--gpus 2'),
+    ('docker', 'all', '--gpus all -e NVIDIA_DRIVER_CAPABILITIES=all'),
+    ('docker', '2', '--gpus 2 -e NVIDIA_DRIVER_CAPABILITIES=all'),
     ('podman', 'all', '--device nvidia.com/gpu=all'),
     ('podman', '1', '--device nvidia.com/gpu=0'),
     ('podman', '2', '--device nvidia.com/gpu=0 --device nvidia.com/gpu=1')])

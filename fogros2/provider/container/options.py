@@ -181,7 +181,8 @@ def common_flags(
 def gpu_flags(engine: Engine, gpus: str) -> Iterator[str]:
     """Yield the flags for 'all' GPUs or a number of them."""
     if engine.name == 'docker':
-        yield from ('--gpus', gpus)
+        # an image that names none gets neither video encoders nor graphics
+        yield from ('--gpus', gpus, '-e', 'NVIDIA_DRIVER_CAPABILITIES=all')
         return
     # Podman names each GPU by the vendor's description (CDI).
     for gpu in range(int(gpus)) if gpus.isdecimal() else [gpus]:
