@@ -16,6 +16,7 @@ import os
 from pathlib import Path
 import pwd
 import re
+import shutil
 import signal
 import socket
 import ssl
@@ -506,7 +507,7 @@ def test_the_agent_is_armed_before_anything_else_runs():
     assert '"end_command": ["shutdown", "-h", "now"]' in script
     assert '"user": "ubuntu"' in script
     assert '--property=Restart=always --property=OOMPolicy=continue' in script
-    assert 'apt' not in script
+    assert 'apt-get' not in script
     assert told['ssh_keys']['ed25519_public'].split() == one_time(TOKEN).public.split()
     assert 'bootcmd' not in config()
 
@@ -517,7 +518,7 @@ def booted(tmp_path):
     def run(told, **variables):
         script = told['bootcmd'][0][2]
         for path in ('/opt/fogros2', '/run/fogros2', '/var/log', '/root/.ssh',
-                     '/etc/needrestart', '/var/lib/systemd'):
+                     '/etc/needrestart', '/etc/apt', '/var/lib/systemd'):
             (tmp_path / path.lstrip('/')).parent.mkdir(parents=True, exist_ok=True)
             script = script.replace(path, f'{tmp_path}{path}')
         (tmp_path / 'var/log').mkdir(exist_ok=True)
@@ -601,6 +602,21 @@ def test_updates_of_the_system_do_not_restart_the_agent(booted):
     top = booted(config(machine='planner', directory='/run/fogros2'))
     settings = top / 'etc/needrestart/conf.d/fogros2.conf'
     assert settings.read_text() == '$nrconf{override_rc}{qr(^fogros2-agent)} = 0;\n'
+
+
+@pytest.mark.parametrize(('on_exit', 'key', 'values'), [
+    ('delete', 'APT::Periodic::Enable', ['0']),
+    ('keep', 'Unattended-Upgrade::Package-Blacklist::',
+     ['linux-', 'nvidia-', 'libnvidia-', 'docker', 'containerd'])])
+def test_upgrades_take_nothing_from_running_nodes(booted, on_exit, key, values):
+    """Neither apt's lock at the first boot, nor later the libraries of NVIDIA's driver."""
+    top = booted(config(machine='planner', directory='/run/fogros2', on_exit=on_exit))
+    settings = top / 'etc/apt/apt.conf.d/90fogros2'
+    assert all(value in settings.read_text() for value in [key.rstrip(':'), *values])
+    if shutil.which('apt-config'):
+        dump = subprocess.run(['apt-config', '-c', settings, 'dump'], capture_output=True,
+                              text=True, check=True).stdout.splitlines()
+        assert {f'{key} "{value}";' for value in values} <= {*dump}
 
 
 def test_nodes_keep_shared_memory_while_nobody_is_logged_in(booted):

@@ -29,6 +29,13 @@ AGENT_DIRECTORY = '/run/fogros2'
 AGENT_PROGRAM = f'{FOLDER}/agent.py'
 END_COMMAND = ('shutdown', '-h', 'now')
 LOG = '/var/log/fogros2-agent.log'
+#: Settings of apt where a launch deletes the machine: Ubuntu's unattended upgrades take time and
+#: apt's lock from the launch.
+NO_UPGRADES = 'APT::Periodic::Enable "0";'
+#: Settings of apt on other machines. An upgrade of NVIDIA's libraries does not fit the driver in
+#: the running kernel, and one of an engine ends its containers.
+CAREFUL_UPGRADES = ('Unattended-Upgrade::Package-Blacklist '
+                    '{ "linux-"; "nvidia-"; "libnvidia-"; "docker"; "containerd"; };')
 #: Seconds for which the agent may fail to start before the machine ends.
 UNGUARDED = 120
 
@@ -80,6 +87,8 @@ cat >{folder}/watchdog.sh <<'{mark}'
 # Ubuntu restarts units after an update of a library, and all nodes run in the agent's
 mkdir -p /etc/needrestart/conf.d
 echo '$nrconf{{override_rc}}{{qr(^fogros2-agent)}} = 0;' >/etc/needrestart/conf.d/fogros2.conf
+mkdir -p /etc/apt/apt.conf.d
+echo {upgrades} >/etc/apt/apt.conf.d/90fogros2
 # logind would remove the user's shared memory and runtime folder after the last logout
 mkdir -p /var/lib/systemd/linger
 touch /var/lib/systemd/linger/{user}
@@ -148,6 +157,8 @@ def cloud_config(
         armed = {'user': user, 'kept_until': f'{FOLDER}/kept_until', **agent_config}
         armed['end_command'] = armed.get('end_command') or list(END_COMMAND)
         names = {'user': user, 'folder': FOLDER, 'program': AGENT_PROGRAM, 'log': LOG,
+                 'upgrades': shlex.quote(NO_UPGRADES if armed.get('on_exit') == 'delete'
+                                         else CAREFUL_UPGRADES),
                  'unguarded': UNGUARDED, 'end': shlex.join(armed['end_command']),
                  'boot_timeout': round(armed.get('boot_timeout', 1800.0))}
         scripts.append(_BOOT.format(
