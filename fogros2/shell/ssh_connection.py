@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import contextlib
 import errno
 import getpass
 import importlib.util
+import io
 import logging
 import os
 from pathlib import Path
@@ -14,7 +16,7 @@ import socket
 import sys
 import threading
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, Optional, TYPE_CHECKING
 import warnings
 
 from fogros2.errors import AuthenticationError, ConnectError, HostKeyError, PrerequisiteError
@@ -422,8 +424,32 @@ def load_key(path: Path, name: str) -> paramiko.PKey:
                 'check the owner and the mode of the file') from error
         except (paramiko.SSHException, ValueError, IndexError):
             continue  # another type of key
+    if (converted := _pkcs8_key(path)) is not None:
+        return converted
     raise AuthenticationError(f'{path} is no private key that SSH knows',
                               'check the content of the file; a full disk leaves it empty')
+
+
+def _pkcs8_key(path: Path) -> Optional[paramiko.PKey]:
+    """
+    Load a private key in the form of OpenSSL, PKCS#8, without a passphrase; None for other files.
+
+    OpenSSH reads that form, paramiko does not.
+    """
+    from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives import serialization
+    import paramiko
+    try:
+        text = serialization.load_pem_private_key(path.read_bytes(), None).private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.OpenSSH,
+            serialization.NoEncryption()).decode()
+    except (TypeError, ValueError, UnsupportedAlgorithm):
+        return None
+    for kind in (paramiko.Ed25519Key, paramiko.ECDSAKey, paramiko.RSAKey):
+        with contextlib.suppress(paramiko.SSHException):
+            key: paramiko.PKey = kind.from_private_key(io.StringIO(text))
+            return key
+    return None
 
 
 def _explained(

@@ -119,9 +119,14 @@ def test_useless_keys_are_named(server, tmp_path):
         assert str(path) in str(refused.value)
 
 
+@pytest.mark.parametrize('pkcs8', [False, True], ids=['', 'of OpenSSL'])
 @pytest.mark.parametrize('kind', ['ecdsa', 'rsa'])
-def test_keys_of_every_type_log_in(server, tmp_path, kind):
+def test_keys_of_every_type_log_in(server, tmp_path, kind, pkcs8):
     path = made_key(tmp_path / 'own', kind)
+    if pkcs8:
+        process.run(Command(('ssh-keygen', '-q', '-p', '-m', 'PKCS8', '-N', '', '-f', str(path))),
+                    timeout=60.0)
+        assert path.read_text().startswith('-----BEGIN PRIVATE KEY')
     with open(server.folder / 'authorized_keys', 'a') as keys:
         keys.write(path.with_suffix('.pub').read_text())
     endpoint = dataclasses.replace(server.endpoint, key_file=str(path))

@@ -157,7 +157,7 @@ def test_ids_that_aren_t_ours_are_unknown(machine_id):
         SSHProvider().describe(machine_id)
 
 
-@pytest.mark.parametrize('content', ['', 'cut'])
+@pytest.mark.parametrize('content', ['', 'cut', '-----BEGIN PRIVATE KEY-----\ncut'])
 def test_damaged_key_is_named_without_an_argument(content: str, tmp_path: Path) -> None:
     """A launch makes the keys of its own machines: they have no argument for a key."""
     from fogros2.errors import AuthenticationError
