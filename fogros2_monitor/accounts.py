@@ -32,7 +32,9 @@ class OwnServer(ThreadingHTTPServer):
 
     def __init__(self, port: int, handler: type[BaseHTTPRequestHandler]) -> None:
         super().__init__(('127.0.0.1', port), handler)
-        self._thread = threading.Thread(target=self.serve_forever, name='fog-http', daemon=True)
+        # close() waits for the end of a poll, in seconds
+        self._thread = threading.Thread(
+            target=self.serve_forever, args=(0.05,), name='fog-http', daemon=True)
         self._thread.start()
 
     def close(self) -> None:

@@ -8,6 +8,7 @@ import http.client
 import json
 import re
 import socket
+import time
 from typing import Any, Optional
 
 import pytest
@@ -193,6 +194,16 @@ def test_content_policy_allows_only_the_pages_script() -> None:
     policy = content_policy('<style>a</style><script>b</script>')
     assert "script-src 'sha256-PiPoFgA5WUoziU9lZOGxNIu9egCI1CxKy3PurtWcAJ0='" in policy
     assert "default-src 'none'" in policy and 'unsafe' not in policy
+
+
+def test_server_stops_at_once() -> None:
+    durations = []
+    for _ in range(3):
+        server = Dashboard(Canned())
+        begin = time.monotonic()
+        server.close()
+        durations.append(time.monotonic() - begin)
+    assert min(durations) < 0.3
 
 
 def test_taken_or_invalid_port_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
