@@ -148,21 +148,8 @@ def sent_at(what: str, payload: bytes) -> int:
     """Return when a message was published (ns), by what the bridge sends of it."""
     if what == TEXT:
         return int(payload[8:].split(b'\0')[0])
-    if what == VIDEO:  # protobuf: the first field is the time
-        seconds, at = varint(payload, 3)
-        return seconds * 10**9 + (varint(payload, at + 1)[0] if payload[at] == 0x10 else 0)
     seconds, nanoseconds = struct.unpack_from('<iI', payload, 4)
     return seconds * 10**9 + nanoseconds
-
-
-def varint(data: bytes, at: int) -> tuple[int, int]:
-    """Return a number of protobuf's, and where it ends."""
-    value = shift = 0
-    while True:
-        value |= (data[at] & 0x7f) << shift
-        shift, at = shift + 7, at + 1
-        if data[at - 1] < 0x80:
-            return value, at
 
 
 async def foxglove(url: str, what: str, seen: Seen) -> None:

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from image_transport_h264.cdr import Header, Writer
+
 FOLDER = Path(__file__).parents[2] / 'benchmarks'
 RESULTS = FOLDER / 'results'
 
@@ -36,3 +38,8 @@ def test_tables_show_stored_figures(benchmark_modules: Any, tmp_path: Path,
         streaming.write_down(name, page.partition('\n')[0].removeprefix('# '), rows, limits)
     for path in tmp_path.glob('*-table.*'):
         assert path.read_text() == (RESULTS / path.name).read_text(), path.name
+
+
+def test_time_of_a_stream_for_viewers_is_read(benchmark_modules: Any) -> None:
+    shown = Writer().header(Header(7, 5, 'camera')).octets(b'frame').string('h264').data()
+    assert benchmark_modules('monitor').sent_at('video', shown) == 7_000_000_005
