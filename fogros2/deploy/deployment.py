@@ -63,7 +63,7 @@ def _run(context: Context, job: RunningMachine) -> None:
         try:
             ros = planned.result() if planned.done() else ros_step.result()
             robot.result()
-            joining.avoid(ros.facts.routes)
+            joining.avoid(ros.facts)
         except BaseException:
             job.cancel.set()
             raise

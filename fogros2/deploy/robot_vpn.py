@@ -13,7 +13,7 @@ from typing import Optional
 
 from fogros2 import plan, process
 from fogros2.deploy.robot import run
-from fogros2.errors import Cancelled, CommandError, FogError, VpnError
+from fogros2.errors import Cancelled, CommandError, ConfigurationError, FogError, VpnError
 from fogros2.model import Command, Peer, VpnInterface
 from fogros2.report import Event, Reporter, step, StepFailed
 from fogros2.vpn import addresses, helped, owner, Vpn
@@ -75,6 +75,8 @@ class RobotVpn:
         self._choose_port = choose_port
         self._lock = threading.Lock()
         self._members: dict[str, VpnMember] = {}
+        #: Where the machines are, by name; see ``HostFacts.network``.
+        self._places: dict[str, str] = {}
         #: The robot as the machines' peer while the interface is up.
         self._peer: Optional[Peer] = None
         self._stop = threading.Event()
@@ -141,6 +143,22 @@ class RobotVpn:
         """Let gc recognise the interface; the helper knows whose its interfaces are."""
         if not self.helped:
             process.run(owner.note(self.interface), timeout=self._timeout, check=False)
+
+    def place(self, name: str, network: str) -> None:
+        """
+        Note the network that a machine has outside the VPN.
+
+        :param network: see ``HostFacts.network``.
+        :raises ConfigurationError: another machine of the launch has it. Two interfaces with the
+            launch's subnet and port can't be in one network.
+        """
+        with self._lock:
+            for other, known in self._places.items():
+                if network and other != name and known == network:
+                    raise ConfigurationError(
+                        f"'{name}' and '{other}' are one computer",
+                        'use one machine for both, or a ContainerInstance there for one of them')
+            self._places[name] = network
 
     def peers_of(self, member: VpnMember) -> list[Peer]:
         """Return the current peers of a machine."""
@@ -209,6 +227,7 @@ class RobotVpn:
     def remove(self, name: str) -> None:
         """Remove a machine from the robot's peers, unless the whole launch is ending."""
         with self._lock:
+            self._places.pop(name, None)
             member = self._members.pop(name, None)
             if member is not None and self._peer is not None and not self._ending.is_set():
                 self._run(self.vpn.peers(self.interface, self._peers()), cancel=False)

@@ -54,6 +54,7 @@ from fogros2.errors import (
 )
 from fogros2.feature import Feature
 from fogros2.host.bootstrap import RosInstall
+from fogros2.host.inspection import HostFacts
 from fogros2.model import (
     Command,
     CreateRequest,
@@ -1013,10 +1014,28 @@ def test_machine_keeps_a_network_that_overlaps_the_vpn(launch, provider):
     joining = Joining(context, mine)
     joining.choose_interface()
     plain = mine.interface
-    joining.avoid(['10.0.0.0/8', '172.17.0.0/16'])
+    joining.avoid(HostFacts(routes=('10.0.0.0/8', '172.17.0.0/16')))
     assert mine.interface == plain
-    joining.avoid(['10.0.0.0/8', plain.network])
+    joining.avoid(HostFacts(routes=('10.0.0.0/8', plain.network)))
     assert mine.interface.host_routes and launch.store.load('planner').vpn == mine.interface
+
+
+def test_two_machines_of_a_launch_are_two_computers(launch, provider):
+    """Both interfaces would have one port and one subnet."""
+    first, second = (Joining(*begun(launch, dataclasses.replace(SPEC, name=name)))
+                     for name in ('planner', 'mapper'))
+    for joining in (first, second):
+        joining.choose_interface()
+        joining.avoid(HostFacts())  # one without /proc
+    lab = HostFacts(network='6f2c1f5e net:[4026531840]')
+    for _ in range(2):  # it is replaced
+        first.avoid(lab)
+    second.avoid(HostFacts(network='6f2c1f5e net:[4026532312]'))  # a container there
+    with pytest.raises(ConfigurationError, match="'mapper' and 'planner' are one computer.*"
+                                                 'use one machine for both'):
+        second.avoid(lab)
+    launch.robot_vpn().remove('planner')
+    second.avoid(lab)
 
 
 @pytest.mark.parametrize(('report', 'order'), [

@@ -15,6 +15,7 @@ from fogros2.deploy.robot_vpn import VpnMember
 from fogros2.deploy.steps.connecting import Connection
 from fogros2.deploy.undo import VPN, vpn_down
 from fogros2.errors import CommandError, FogError, VpnError
+from fogros2.host.inspection import HostFacts
 from fogros2.model import Command, host_port, Machine, Peer, VpnInterface
 from fogros2.report import step
 from fogros2.store import Made
@@ -50,16 +51,19 @@ class Joining(Step):
             '' if context.capabilities.owned else f'{job.directory}/agent.pid')
         job.save(vpn=job.interface)
 
-    def avoid(self, routes: Sequence[str]) -> None:
+    def avoid(self, facts: HostFacts) -> None:
         """
-        Adapt the interface to a machine with these routes (IPv4, CIDR).
+        Adapt the interface to the machine's networks.
 
         The robot chose the launch's subnet before the machine existed, and its nodes may already
         run, so the subnet stays. If one of the machine's networks overlaps the subnet, the machine
         routes only its peers' addresses into the VPN.
+
+        :raises ConfigurationError: another machine of the launch is the same computer.
         """
         job = self._job
-        if addresses.overlapping(job.interface.network, routes):
+        self._context.vpn.place(job.name, facts.network)
+        if addresses.overlapping(job.interface.network, facts.routes):
             job.interface = dataclasses.replace(job.interface, host_routes=True)
             job.save(vpn=job.interface)
 
@@ -196,7 +200,7 @@ class Joined(Joining):
         job.interface = other.interface
         job.heartbeats = (other.heartbeats, other.own.address)
 
-    def avoid(self, routes: Sequence[str]) -> None:
+    def avoid(self, facts: HostFacts) -> None:
         """Do nothing: the interface exists."""
 
     def join(self) -> None:
