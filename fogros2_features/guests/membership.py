@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
 import dataclasses
+import fcntl
 import functools
 import os
 from pathlib import Path
@@ -19,6 +21,7 @@ from fogros2.model import OtherVpn, Peer, to_json, VpnInterface
 from fogros2.store import (
     boot_id,
     launch_process,
+    make_folder,
     OTHER_VPN,
     process_start,
     Store,
@@ -52,50 +55,64 @@ def join(
     invitation = unseal(text, key)
     vendor = _vendor(invitation, environment)
     folder = store.root / 'launches' / invitation.number
-    up = is_up(invitation)
-    if owner is None or up and launch_process(folder) == (1, True):
-        owner = {'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()}
-    other = other_vpn(invitation, store)
-    if up and stored_vpn(folder) == other and secret_of(folder) == invitation.secret:
-        if owner['pid'] == 1 or not is_held(folder):
-            write_private(folder / 'process.json', to_json(owner).encode())
-        return folder
-    if not invitation.private and not agreed(
-            f'{invitation.network} has public addresses. Send what is for them to the computer '
-            f"that wrote this invitation, '{invitation.machine}' at {invitation.endpoint}?"):
-        raise ConfigurationError(
-            f"the invitation to '{invitation.machine}' would take the public addresses "
-            f'{invitation.network}',
-            'ros2 fog join in a terminal asks whether you want that; a launch does not')
-    check_robot()
-    before = store.other_vpns().get(invitation.machine, folder)
-    if before != folder:
-        _check_left(before, invitation)
-        clear(before)  # of a launch with this machine that has ended, or of this machine before
-    if not up:
-        _check_free(invitation)
-    # not the port that the user chose: that is for the robot's end of a launch's own VPN
-    interface = dataclasses.replace(other.own, port=addresses.choose_port())
-    vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
-        ports=vendor.ports, asked=addresses_of(vendor.asked(environment)))
-    private = base64.b64encode(key).decode()
-    store.launch_folder(invitation.number)
-    write = functools.partial(_write, folder, invitation, other, vendor, environment, owner)
-    try:
-        if not up:  # else the former ones hold until the interface has changed
-            write()
-        if helped.made(interface):
-            process.run(helped.lend(interface, private), timeout=Timeouts().vpn)
-        else:
-            write_private(Path(interface.key_file), f'{private}\n'.encode())
-        run(vpn.up(interface, [other.machine]), timeout=Timeouts().vpn)
-        if up:
-            write()
-    except BaseException:
+    with changing(store):
+        up = is_up(invitation)
+        if owner is None or up and launch_process(folder) == (1, True):
+            owner = {'pid': 1, 'pid_start': process_start(1) or 0, 'boot': boot_id()}
+        other = other_vpn(invitation, store)
+        if up and stored_vpn(folder) == other and secret_of(folder) == invitation.secret:
+            if owner['pid'] == 1 or not is_held(folder):
+                write_private(folder / 'process.json', to_json(owner).encode())
+            return folder
+        if not invitation.private and not agreed(
+                f'{invitation.network} has public addresses. Send what is for them to the '
+                f"computer that wrote this invitation, '{invitation.machine}' at "
+                f'{invitation.endpoint}?'):
+            raise ConfigurationError(
+                f"the invitation to '{invitation.machine}' would take the public addresses "
+                f'{invitation.network}',
+                'ros2 fog join in a terminal asks whether you want that; a launch does not')
+        check_robot()
+        before = store.other_vpns().get(invitation.machine, folder)
+        if before != folder:
+            _check_left(before, invitation)
+            # of a launch with this machine that has ended, or of this machine before
+            clear(before)
         if not up:
-            clear(folder)
-        raise
-    return folder
+            _check_free(invitation)
+        # not the port that the user chose: that is for the robot's end of a launch's own VPN
+        interface = dataclasses.replace(other.own, port=addresses.choose_port())
+        vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
+            ports=vendor.ports, asked=addresses_of(vendor.asked(environment)))
+        private = base64.b64encode(key).decode()
+        store.launch_folder(invitation.number)
+        write = functools.partial(_write, folder, invitation, other, vendor, environment, owner)
+        try:
+            if not up:  # else the former ones hold until the interface has changed
+                write()
+            if helped.made(interface):
+                process.run(helped.lend(interface, private), timeout=Timeouts().vpn)
+            else:
+                write_private(Path(interface.key_file), f'{private}\n'.encode())
+            run(vpn.up(interface, [other.machine]), timeout=Timeouts().vpn)
+            if up:
+                write()
+        except BaseException:
+            if not up:
+                clear(folder)
+            raise
+        return folder
+
+
+@contextlib.contextmanager
+def changing(store: Store) -> Iterator[None]:
+    """Wait until no other terminal or launch of this user joins or leaves a VPN."""
+    lock = os.open(make_folder(store.root / 'launches'), os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
 
 
 def other_vpn(invitation: Invitation, store: Store) -> OtherVpn:
@@ -199,9 +216,10 @@ def leave(name: str, store: Store) -> None:
 
     :raises ConfigurationError: this computer has not joined the machine.
     """
-    folders = store.other_vpns()
-    if name not in folders:
-        raise ConfigurationError(
-            f"this computer has not joined a machine '{name}'",
-            did_you_mean(name, [*folders], 'ros2 fog join INVITATION joins one'))
-    clear(folders[name])
+    with changing(store):
+        folders = store.other_vpns()
+        if name not in folders:
+            raise ConfigurationError(
+                f"this computer has not joined a machine '{name}'",
+                did_you_mean(name, [*folders], 'ros2 fog join INVITATION joins one'))
+        clear(folders[name])

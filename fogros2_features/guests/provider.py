@@ -74,9 +74,10 @@ class JoinedProvider(Provider):
         try:
             yield
         finally:
-            # others may have joined meanwhile
-            if not by_hand and launch_process(folder)[0] == os.getpid():
-                clear(folder)
+            with membership.changing(Store()):
+                # others may have joined meanwhile
+                if not by_hand and launch_process(folder)[0] == os.getpid():
+                    clear(folder)
 
     def create(self, spec: MachineSpec, request: CreateRequest) -> str:
         """Return the id of the machine, which the launch has joined."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 import contextlib
 import dataclasses
+import fcntl
 import json
 import os
 from pathlib import Path
@@ -30,6 +31,7 @@ from fogros2.model import (
     VpnInterface,
 )
 from fogros2.store import (
+    delete_folder,
     launch_process,
     OTHER_VPN,
     process_start,
@@ -293,6 +295,43 @@ def test_launch_leaves_the_vpn_that_others_use(
             membership.join(text, store, {})
     (folder,) = store.other_vpns().values()
     assert launch_process(folder) == (owner['pid'] if at_once else 1, True) and cleared == []
+
+
+def test_terminals_that_join_at_once_wait_for_each_other(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    """One that fails beside another would clear the interface of both."""
+    store, alone = Store(tmp_path / 'second'), list[str]()
+    text = invitation.seal(invitation.Invitation(
+        'planner', OTHER, '198.18.7.2', '203.0.113.9:30000', '198.18.7.224', '198.18.7.0/24',
+        'rmw_cyclonedds_cpp', 7, time.time() + 60), invitation.public_text(
+            invitation.own_key(store)))
+
+    def note(step: str) -> str:
+        other = os.open(store.root / 'launches', os.O_RDONLY)
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.close(other)
+        alone.append(step)
+        return ''
+
+    monkeypatch.setattr(membership, 'check_robot', lambda: None)
+    monkeypatch.setattr(membership, 'is_up', lambda invitation: bool(note('look')))
+    monkeypatch.setattr(membership, 'run', lambda commands, **k: note('run'))
+    monkeypatch.setattr(membership, 'clear', lambda folder: note('clear'))
+    membership.join(text, store, {})
+    membership.leave('planner', store)
+    assert (alone[:2], alone[-2:]) == (['look', 'run'], ['run', 'clear'])
+    # a launch's end
+    (folder,) = store.other_vpns().values()
+    delete_folder(folder)
+    monkeypatch.setattr(membership, 'is_up', lambda invitation: False)
+    monkeypatch.setattr(provider, 'Store', lambda: store)
+    monkeypatch.setattr('fogros2.deploy.robot.clear', lambda folder: note('end'))
+    spec = MachineSpec('m', 'joined', options={'invitation': text})
+    with provider.JoinedProvider().join(spec, 'rmw_cyclonedds_cpp', 7, {}):
+        pass
+    assert alone[-1] == 'end'
 
 
 def test_invitation_that_fails_leaves_the_former_vpn(
