@@ -12,6 +12,7 @@ from fogros2 import untrusted
 from fogros2.errors import ConfigurationError, VpnError
 from fogros2.model import Command, VpnInterface
 from fogros2.shell import Shell
+from fogros2.shell.command_line import write_script
 from fogros2.store import Record
 from fogros2.vpn.wireguard import more
 from fogros2_features.guests import network, program
@@ -36,8 +37,8 @@ class Guest(TypedDict):
 def install(interface: VpnInterface) -> Command:
     """Return the command that puts the program on the machine."""
     return Command(
-        ('sh', '-ec', 'umask 077; cat >"$1.new"; mv -f "$1.new" "$1"', 'sh', more(interface)),
-        sudo=True, input=Path(program.__file__).read_bytes(), what='prepare the VPN for guests')
+        ('sh', '-ec', write_script(more(interface), 0o600)), sudo=True,
+        input=Path(program.__file__).read_bytes(), what='prepare the VPN for guests')
 
 
 def request(interface: VpnInterface, verb: str, content: object = None) -> Command:

@@ -10,6 +10,7 @@ import fcntl
 import json
 import os
 from pathlib import Path
+import subprocess
 import time
 from types import SimpleNamespace
 from typing import Any
@@ -40,6 +41,7 @@ from fogros2.store import (
     this_process,
     write_private,
 )
+from fogros2.waiting import wait_until
 from fogros2_features.guests import invitation, listing, membership, program, provider
 from fogros2_testing.fakes import FakeShell, MemoryProvider
 from fogros2_testing.plugins import instead
@@ -67,11 +69,11 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
     found: list[tuple[str, Any]] = []
 
     def answer(command: Command) -> Result:
-        assert command.sudo and command.argv[4] == '/run/fogabc123m0.more'
-        if len(command.argv) == 5:
-            assert command.input == Path(program.__file__).read_bytes()
+        assert command.sudo
+        if command.input == Path(program.__file__).read_bytes():
+            assert command.argv[2].startswith('umask 077; target=/run/fogabc123m0.more; ')
             return Result(0, '', '')
-        assert command.argv[5] == 'fogabc123m0'
+        assert command.argv[4:6] == ('/run/fogabc123m0.more', 'fogabc123m0')
         request = json.loads(command.input)
         found.append((command.argv[6], request))
         own = {'key': (request or {}).get('key', OTHER), 'label': 'robot2',
@@ -232,6 +234,21 @@ def test_machine_that_lies_about_its_guests_is_reported(
         shell = FakeShell(handlers={'sh': lambda c, text=text: Result(0, text, '')})
         with pytest.raises(VpnError, match='invalid list of guests'):
             listing.ask(shell, Store().load('planner'), 'look')
+
+
+def test_invitations_written_at_once_leave_the_program_whole(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    path = tmp_path / 'fogabc123m0.more'
+    monkeypatch.setattr(listing, 'more', lambda interface: str(path))
+    command = listing.install(VpnInterface('fogabc123m0', '', '198.18.7.0/24', 0, ''))
+    assert command.input is not None
+    with subprocess.Popen(command.argv, stdin=subprocess.PIPE) as slow:
+        wait_until(lambda: any(tmp_path.iterdir()), timeout=20.0, what='begin')
+        subprocess.run(command.argv, input=command.input, check=True)
+        slow.communicate(command.input)
+    assert slow.returncode == 0 and [*tmp_path.iterdir()] == [path]
+    assert path.read_bytes() == command.input and path.stat().st_mode & 0o777 == 0o600
 
 
 def test_folder_of_a_joined_machine_stays_until_a_reboot(
