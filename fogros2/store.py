@@ -150,12 +150,37 @@ def this_process() -> dict[str, Any]:
     return {'pid': pid, 'pid_start': process_start(pid) or 0, 'boot': boot_id()}
 
 
+def hold(folder: Path) -> int:
+    """
+    Lock a folder for as long as this process runs; return the file descriptor.
+
+    A container that shares the folder does not see this process, but sees the lock.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    return handle
+
+
+def held(folder: Path) -> bool:
+    """Return whether a process that may be in another container holds a folder."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(handle)
+    return False
+
+
 def launch_process(folder: Path) -> tuple[int, bool]:
     """Return the id of a launch's process, 0 if its folder does not tell, and whether it runs."""
     try:
         data = json.loads((folder / 'process.json').read_text())
         pid = int(data['pid'])
-        return pid, process_alive(pid, int(data['pid_start']), str(data.get('boot', '')))
+        return pid, held(folder) or process_alive(
+            pid, int(data['pid_start']), str(data.get('boot', '')))
     except (OSError, ValueError, KeyError, TypeError):
         return 0, False
 
@@ -400,10 +425,10 @@ class Store:
             unfinished = _UNFINISHED.fullmatch(path.name)
             if not unfinished or process_start(int(unfinished[1])) is not None:
                 continue
-            if path.is_dir():
-                delete_folder(path)
-            else:
+            if not path.is_dir():
                 path.unlink(missing_ok=True)
+            elif not held(path):
+                delete_folder(path)
         for path in (self.root / 'machines').glob('*'):
             with contextlib.suppress(NameTaken, ConfigurationError, OSError):
                 if path.name.startswith('.') or not any(path.iterdir()):
@@ -570,6 +595,7 @@ def process_folder() -> Path:
     home = make_folder(state_home())
     try:
         folder = tempfile.mkdtemp(dir=home, prefix=f'.process.{os.getpid()}.')
+        hold(Path(folder))
     except OSError as error:
         raise _not_written(home, error) from error
     atexit.register(shutil.rmtree, folder, ignore_errors=True)

@@ -48,7 +48,7 @@ from fogros2.journal import Journal
 from fogros2.model import DdsInterface, MachineSpec, MachineState, NodeSpec, OtherVpn
 from fogros2.provider import Provider
 from fogros2.report import Reporter, silent, step, StepFailed, Warned
-from fogros2.store import delete_folder, Record, Store, this_process, write_private
+from fogros2.store import delete_folder, hold, Record, Store, this_process, write_private
 from fogros2.vpn import addresses, Vpn
 from fogros2.waiting import in_thread, Timeouts
 
@@ -375,6 +375,7 @@ class Launch:
         with self._lock:
             if self._vpn is None:
                 folder = self.store.launch_folder(self.id)
+                self.undo.callback(os.close, hold(folder))
                 self.undo.add('VPN interface', self._clear)
                 # `ros2 fog gc` reads this to recognise the folder of a killed launch
                 write_private(

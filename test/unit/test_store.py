@@ -25,6 +25,7 @@ from fogros2.model import Endpoint, MachineSpec, OtherVpn, Peer, to_json, VpnInt
 from fogros2.store import (
     boot_id,
     is_another_robot,
+    launch_process,
     Made,
     process_alive,
     process_start,
@@ -233,6 +234,31 @@ def test_after_a_boot_no_process_is_one_from_before(monkeypatch):
     mine = {'pid': os.getpid(), 'pid_start': process_start(os.getpid())}
     assert record(boot=boot_id(), **mine).launch_alive
     assert not record(boot='another boot', **mine).launch_alive
+
+
+def test_launch_of_another_container_runs(store):
+    """Containers that share the state folder do not see each other's processes."""
+    code = (
+        'import os; from fogros2 import model, store\n'
+        'folder = store.Store().launch_folder("a1b2c3")\n'
+        'store.hold(folder); store.process_folder()\n'
+        'store.write_private(folder / "process.json",'
+        ' model.to_json({**store.this_process(), "pid": 2 ** 22}).encode())\n'
+        'print("runs", flush=True); input()')
+    folder = store.launch_folder('a1b2c3')
+    with subprocess.Popen(
+            [sys.executable, '-c', code],
+            env={**os.environ, 'FOGROS2_STATE_HOME': str(store.root)},
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout.readline() == b'runs\n'
+        (unfinished,) = store.root.glob('.process.*')
+        private = unfinished.rename(unfinished.with_name(
+            re.sub('[0-9]+', str(2 ** 22), unfinished.name, count=1)))
+        store.sweep()
+        assert launch_process(folder) == (2 ** 22, True) and private.is_dir()
+        child.kill()
+    store.sweep()
+    assert launch_process(folder) == (2 ** 22, False) and not private.exists()
 
 
 def test_a_zombie_counts_as_gone():
