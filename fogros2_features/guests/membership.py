@@ -79,7 +79,7 @@ def join(
             # of a launch with this machine that has ended, or of this machine before
             clear(before)
         if not up:
-            _check_free(invitation)
+            _check_free(invitation, store)
         # not the port that the user chose: that is for the robot's end of a launch's own VPN
         interface = dataclasses.replace(other.own, port=addresses.choose_port())
         vpn: Vpn = plugin_system.load('fogros2.vpn', 'wireguard')(
@@ -178,14 +178,28 @@ def _check_left(folder: Path, invitation: Invitation) -> None:
                                  f'ros2 fog leave {name} leaves that one')
 
 
-def _check_free(invitation: Invitation) -> None:
+def _launch(interface: str) -> str:
+    """Return the part of a machine's interface name that all machines of its launch have."""
+    return interface.rpartition('m')[0]
+
+
+def _check_free(invitation: Invitation, store: Store) -> None:
     """
     Check that no network of this computer has addresses of the VPN.
 
+    :raises ConfigurationError: this computer has joined another machine of the same launch.
     :raises VpnError: one has.
     """
     used = addresses.parse_used(run([addresses.used_networks()], timeout=Timeouts().vpn))
     if overlaps := addresses.overlapping(invitation.network, used):
+        for name, folder in store.other_vpns().items():
+            other = stored_vpn(folder)
+            if other is not None and other.own.network == invitation.network and \
+                    _launch(other.interface.name) == _launch(invitation.interface):
+                raise ConfigurationError(
+                    f"this computer is in the VPN of '{invitation.machine}' already, by '{name}'",
+                    'a computer can join one machine of a launch: '
+                    f'ros2 fog leave {name} leaves that one')
         raise VpnError(
             f"the VPN of '{invitation.machine}' has the addresses {invitation.network}, and this "
             f'computer uses {overlaps[0]}',

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from ros2cli.cli import main
 
-from fogros2.errors import CommandError, VpnError
+from fogros2.errors import CommandError, FogError, VpnError
 from fogros2.model import (
     Command,
     Endpoint,
@@ -376,6 +376,28 @@ def test_invitation_that_fails_leaves_the_former_vpn(
     assert membership.secret_of(folder) == 32 * 'aa'
     assert membership.join(second, store, {}) == folder
     assert membership.secret_of(folder) == 32 * 'bb'
+
+
+@pytest.mark.parametrize(('interface', 'error'), [
+    ('foga1b2c3m1', "in the VPN of 'mapper' already, by 'planner'.*ros2 fog leave planner "),
+    ('fogd4e5f6m0', "the VPN of 'mapper' has the addresses 198.18.7.0/24, and this computer")])
+def test_second_machine_of_a_launch_names_the_first(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, interface: str, error: str,
+) -> None:
+    """All machines of a launch have one subnet, whatever the pool is."""
+    store = Store(tmp_path / 'second')
+    first, second = (invitation.seal(invitation.Invitation(
+        name, key, '198.18.7.2', '203.0.113.9:30000', '198.18.7.224', '198.18.7.0/24',
+        'rmw_cyclonedds_cpp', 7, time.time() + 60, each), invitation.public_text(
+            invitation.own_key(store))) for name, key, each in (
+                ('planner', OTHER, 'foga1b2c3m0'), ('mapper', f'A{OTHER[1:]}', interface)))
+    monkeypatch.setattr(membership, 'check_robot', lambda: None)
+    monkeypatch.setattr(membership, 'run', lambda commands, **k: '')
+    membership.join(first, store, {})
+    monkeypatch.setattr(membership.addresses, 'parse_used', lambda text: ['198.18.7.0/24'])
+    with pytest.raises(FogError, match=error):
+        membership.join(second, store, {})
+    assert [*store.other_vpns()] == ['planner']
 
 
 def test_leave_names_the_nearest_machine() -> None:
