@@ -133,6 +133,19 @@ class Reader:
             self._link.shutdown(socket.SHUT_RDWR)
 
 
+def machine_of(own: Path, folders: Path) -> str:
+    """
+    Return the name of the folder that a machine has in the folder of all.
+
+    :raises FileNotFoundError: it has none.
+    """
+    for folder in folders.iterdir():
+        with contextlib.suppress(OSError):  # another machine begins or ends
+            if os.path.samefile(folder / OWN, own):
+                return folder.name
+    raise FileNotFoundError(f'{folders} has no folder of this machine')
+
+
 class Relay(Node):
     """
     The node.
@@ -145,8 +158,7 @@ class Relay(Node):
         self._shared = {name: Shared() for name in settings['topics']}
         self._own, self._others = map(Path, settings['folders'])
         #: The name of this machine's folder.
-        self._machine = next(folder.name for folder in self._others.iterdir()
-                          if os.path.samefile(folder / OWN, self._own))
+        self._machine = machine_of(self._own, self._others)
         #: Guards everything below, and the topics.
         self._lock = threading.Lock()
         self._robots: dict[Path, threading.Thread] = {}

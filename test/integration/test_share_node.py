@@ -18,7 +18,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int32, String
 
 from fogros2.waiting import wait_until
-from fogros2_share.node import NAME, OWN, Relay
+from fogros2_share.node import machine_of, NAME, OWN, Relay
 from fogros2_share.wire import encode, Form
 from rigs.sharing import BEST_EFFORT, LATCHED, repeated, Robot, robot
 
@@ -218,6 +218,16 @@ def test_relay_without_its_folder_says_why(robot: Callable[[str], Robot]) -> Non
     assert one.relay is not None and one.relay.wait(60) == 1
     wait_until(lambda: any('made without share=' in line for line in one.lines), timeout=60,
                what='the reason')
+
+
+def test_relay_finds_its_folder_while_others_begin(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:
+    """Such as one that a power cut left without ``own``, or that this user may not read yet."""
+    own = tmp_path / 'mine' / OWN
+    own.mkdir(parents=True)
+    monkeypatch.setattr(Path, 'iterdir', lambda _: iter((tmp_path / 'begun', own.parent)))
+    assert machine_of(own, tmp_path) == 'mine'
 
 
 def test_relay_closes_before_a_thread_has_started() -> None:
