@@ -28,7 +28,7 @@ from fogros2.model import Command, MachineSpec, NodeSpec
 from fogros2.ros_names import check_name
 from fogros2.shell.command_line import remote_path
 from fogros2.shell.sync import size_on_disk, Stall
-from fogros2.store import check_owner
+from fogros2.store import check_owner, robot_id
 
 if TYPE_CHECKING:
     from launch import SomeSubstitutionsType
@@ -44,12 +44,17 @@ SLOWEST = 10e3
 SLACK = 100e6
 #: Bytes, or half of what is free, that no copy takes from the robot's disk.
 SPARE = 1e9
-#: Where a machine, by its name, keeps recordings until they come home, and the name of the folder.
-RECORDINGS, RECORDED = '~/fogros2-{}', 'recordings'
+#: Name of the folder in which recordings are, there and here.
+RECORDED = 'recordings'
 _UNITS = {'': 1.0, 'k': 1e3, 'M': 1e6, 'G': 1e9, 'T': 1e12}
 # Print the bytes in the folder {0}, or in the one that it links to; nothing without the folder.
 # Hard links count each, because each becomes a file here.
 _SIZE = '[ ! -d {0} ] || du -sbl -- {0}/. | cut -f 1'
+
+
+def recordings_of(machine: str) -> str:
+    """Return where a machine keeps recordings until they come home; robots may share a host."""
+    return f"~/fogros2-{machine}-{robot_id().rpartition('-')[2]}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +115,7 @@ class Results(Feature):
 
     def beside(self, spec: MachineSpec, own: Wanted) -> Sequence[NodeSpec]:
         """Return the program that records, with the names that streams give to topics there."""
-        folder = f'{RECORDINGS.format(spec.name)}/{RECORDED}'
+        folder = f'{recordings_of(spec.name)}/{RECORDED}'
         return [NodeSpec(
             id=f'record-{spec.name}', name='record', package='fogros2', executable='record',
             arguments=(folder, *own.topics, '--ros-args'))] if own.topics else []
@@ -119,7 +124,7 @@ class Results(Feature):
     def machine(self, running: RunningMachine, own: Wanted) -> Iterator[None]:
         """Bring the folders home when the machine's nodes have ended."""
         yield
-        recordings = RECORDINGS.format(running.spec.name)
+        recordings = recordings_of(running.spec.name)
         if own.topics:
             own = dataclasses.replace(own, folders=(*own.folders, f'{recordings}/{RECORDED}'))
         if own.folders and not running.lost:

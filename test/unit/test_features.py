@@ -32,6 +32,7 @@ from fogros2.errors import (
 from fogros2.feature import Feature
 from fogros2.model import MachineSpec
 from fogros2.report import silent
+from fogros2.store import robot_id
 from fogros2_features import results
 from fogros2_features.results import Results
 from fogros2_testing.fakes import FakeProvider, FakeRunning
@@ -457,16 +458,21 @@ def test_recorded_topics_have_a_program_beside_the_nodes() -> None:
     own = Results.options(record=['/tf', '/scan', '/tf'])
     program, = Results().beside(MachineSpec('mapper', 'container'), own)
     assert (program.package, program.executable) == ('fogros2', 'record')
-    assert program.arguments == ('~/fogros2-mapper/recordings', '/tf', '/scan', '--ros-args')
+    robot = robot_id().rpartition('-')[2]
+    assert program.arguments == (
+        f'~/fogros2-mapper-{robot}/recordings', '/tf', '/scan', '--ros-args')
     assert Results().beside(MachineSpec('mapper', 'container'), Results.options()) == []
 
 
 def test_recordings_come_home_once(home: Path) -> None:
-    folder = home / 'fogros2-a/recordings'
+    folder = home / results.recordings_of('a')[2:] / 'recordings'
     folder.mkdir(parents=True)
     (folder / '1.mcap').write_text('tf')
+    other = home / 'fogros2-a-0f0f0f0f/recordings/2.mcap'  # of another robot that shares the host
+    other.parent.mkdir(parents=True)
+    other.touch()
     assert brought(FakeRunning(), record=['/tf']) == ['recordings/1.mcap=tf']
-    assert not folder.parent.exists()
+    assert not folder.parent.exists() and other.exists()
     folder.mkdir(parents=True)
     (folder / '2.mcap').write_text('too much')
     with pytest.raises(ShellError, match='more than fetch_limit='):
