@@ -28,7 +28,9 @@ _TOKEN = re.compile('[A-Za-z0-9_-]{1,100}')
 def on_robot(name: str) -> Optional[tuple[int, str]]:
     """Return port and token of the bridge of a machine that this robot replaces, or None."""
     folder = addresses.on_robot(Store(), name)
-    for path in folder.glob('monitor-*/*/token'):
+    paths = [path for path in folder.glob('monitor-*/*/token') if addresses.is_used(path.parent)]
+    # of two launches with one port, the first one's gate has it
+    for path in sorted(paths, key=lambda path: path.stat().st_mtime):
         port = int(path.parts[-3].partition('-')[2])
         with contextlib.suppress(OSError), socket.create_connection(
                 ('127.0.0.1', port), timeout=_TIMEOUT) as link:

@@ -9,6 +9,7 @@ import contextlib
 import functools
 import logging
 import os
+from pathlib import Path
 import shutil
 from typing import Any, Optional, TYPE_CHECKING, Union
 from weakref import WeakKeyDictionary
@@ -167,14 +168,22 @@ def _options(
 
 def _on_robot(name: str, port: int, topics: Sequence[str]) -> list[LaunchDescriptionEntity]:
     """Serve the robot's topics on its loopback; delete the token when the launch ends."""
-    folder = addresses.on_robot(Store(), name)
+    folder = Path(addresses.folder_of(
+        str(addresses.on_robot(Store(), name)), port, addresses.of_process(os.getpid())))
     process = AddedProcess(_bridge('robot', port, topics, [
-        '--secrets', addresses.folder_of(str(folder), port, str(os.getpid()))]))
+        '--secrets', str(folder)]))
     return [process, _once_started(process, lambda: _logger().info(
         f"{name}: Foxglove at {addresses.bridge('127.0.0.1', port)}; "
         f'in a browser: ros2 fog monitor {name}')),
-        RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: shutil.rmtree(
-            folder, ignore_errors=True)))]
+        RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: _remove(folder)))]
+
+
+def _remove(folder: Path) -> None:
+    """Delete a launch's credentials, and the folders above that no other launch uses."""
+    shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        folder.parent.rmdir()
+        folder.parent.parent.rmdir()
 
 
 def _bridge(

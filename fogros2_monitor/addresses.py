@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from fogros2.model import host_port
-from fogros2.store import Store
+from fogros2.store import process_start, Store
 
 #: Port on which viewers expect a bridge.
 PORT = 8765
@@ -20,6 +20,8 @@ IMAGE = ('ghcr.io/lichtblick-suite/lichtblick@sha256:'
 NOTE, NOTE_OPEN = 'monitor', 'monitor_open'
 #: What the name of the folder begins with that the credentials of one port are in.
 CREDENTIALS = 'monitor-'
+#: What stands for a launch's id in it on the robot: the launch's process.
+_PROCESS = 'process-'
 
 
 def gate_port(port: int) -> int:
@@ -64,3 +66,14 @@ def folder_of(agent: str, port: int, launch: str) -> str:
 def on_robot(store: Store, name: str) -> Path:
     """Return the folder that stands for the agent's where the machine ``name`` is the robot."""
     return store.root / f'monitor-{name}'
+
+
+def of_process(pid: int) -> str:
+    """Return what stands for a launch's id on the robot, where several may have one name."""
+    return f'{_PROCESS}{pid}'
+
+
+def is_used(folder: Path) -> bool:
+    """Return whether a launch that runs on the robot has its credentials in a folder."""
+    pid = folder.name.removeprefix(_PROCESS)
+    return pid != folder.name and pid.isdecimal() and process_start(int(pid)) is not None

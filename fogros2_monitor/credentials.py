@@ -16,7 +16,7 @@ import ssl
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2_monitor.addresses import CREDENTIALS
+from fogros2_monitor import addresses
 
 #: Validity of a certificate in days; longer than the lifetime of any machine.
 DAYS = 365
@@ -33,7 +33,7 @@ class Credentials:
 
 def make_token(folder: Path) -> Credentials:
     """
-    Create the token unless it exists; delete the credentials of earlier launches.
+    Create the token unless it exists; delete the credentials of launches that have ended.
 
     :param folder: folder of this launch, see ``addresses.folder_of``. The function creates
         the folder and its parents with mode 0700.
@@ -41,8 +41,10 @@ def make_token(folder: Path) -> Credentials:
     """
     credentials = Credentials(folder)
     if not credentials.token.exists():
-        if folder.parent.name.startswith(CREDENTIALS):
-            shutil.rmtree(folder.parent, ignore_errors=True)
+        if folder.parent.name.startswith(addresses.CREDENTIALS):
+            for other in folder.parent.glob('*'):
+                if not addresses.is_used(other):
+                    shutil.rmtree(other, ignore_errors=True)
         for each in (*reversed(folder.parents), folder):
             each.mkdir(mode=0o700, exist_ok=True)
         unfinished = folder / 'token.new'

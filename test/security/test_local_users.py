@@ -357,8 +357,9 @@ def test_no_account_stands_for_the_bridge_on_the_robot(
     with stranger(SQUAT) as child, socket.create_server(('127.0.0.1', 0)) as own:
         assert child.stdout
         port = int(child.stdout.readline()) if theirs else own.getsockname()[1]
-        token = credentials.make_token(Path(addresses.folder_of(
-            str(addresses.on_robot(Store(), 'planner')), port, '1'))).token.read_text().strip()
+        folder = Path(addresses.folder_of(
+            str(addresses.on_robot(Store(), 'planner')), port, addresses.of_process(1)))
+        token = credentials.make_token(folder).token.read_text().strip()
         assert access.on_robot('planner') == (None if theirs else (port, token))
     # for localhost, a browser may try [::1] first, where another account may listen
     verbs.show_here('planner', port, token, browser=False)

@@ -238,7 +238,7 @@ def test_bridge_gets_the_options_of_the_machine(monkeypatch, made, runs, on_robo
     # the robot's own has neither others nor an application
     if on_robot:
         folder = addresses.on_robot(Store(), 'planner')
-        assert words[4:-5] == ['--secrets', f'{folder}/monitor-9000/{os.getpid()}']
+        assert words[4:-5] == ['--secrets', f'{folder}/monitor-9000/process-{os.getpid()}']
     else:
         assert words[4:-5] == [
             '--secrets', '$FOGROS2_AGENT_DIRECTORY/monitor-9000/abc123', '--vpn', '9000',

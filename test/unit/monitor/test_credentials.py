@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import shutil
+import socket
 import ssl
 import stat
 
@@ -12,7 +14,8 @@ import pytest
 
 from fogros2 import process
 from fogros2.model import Command
-from fogros2_monitor import addresses, credentials
+from fogros2.store import Store
+from fogros2_monitor import access, action, addresses, credentials
 
 with_openssl = pytest.mark.skipif(shutil.which('openssl') is None, reason='needs openssl')
 
@@ -32,6 +35,27 @@ def test_credentials_are_private_and_kept_for_a_launch(tmp_path):
     another = credentials.make(folder.parent / 'd4e5f6', 'planner')
     assert another.token.read_text() != token
     assert not folder.exists()
+
+
+def test_launches_with_one_name_on_the_robot_keep_their_tokens():
+    top = addresses.on_robot(Store(), 'mapper')
+    with socket.create_server(('127.0.0.1', 0)) as gate, \
+            socket.create_server(('127.0.0.1', 0)) as further:
+        port, another = gate.getsockname()[1], further.getsockname()[1]
+        first, dead, second, beside = (
+            Path(addresses.folder_of(str(top), at, addresses.of_process(pid)))
+            for at, pid in ((port, os.getpid()), (port, 2 ** 22), (port, 1), (another, 1)))
+        token = credentials.make_token(first).token.read_text().strip()
+        os.utime(credentials.Credentials(first).token, (1.0, 1.0))
+        for folder in (dead, second):
+            credentials.make_token(folder)
+        assert access.on_robot('mapper') == (port, token) and not dead.exists()
+        theirs = credentials.make_token(beside).token.read_text().strip()
+        action._remove(first)
+        action._remove(second)
+        assert access.on_robot('mapper') == (another, theirs)
+    action._remove(beside)
+    assert not top.exists()
 
 
 @with_openssl
