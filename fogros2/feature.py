@@ -221,6 +221,10 @@ class LaunchedMachine(Protocol):
     def renamed(self) -> Mapping[str, str]:
         """New names of topics and services of its nodes, by the names that others have too."""
 
+    @property
+    def sent(self) -> Sequence[NodeSpec]:
+        """Its nodes that have started, or are about to, as they were before ``starting``."""
+
 
 class RunningLaunch(Protocol):
     """

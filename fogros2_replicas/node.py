@@ -10,6 +10,7 @@ services.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+import difflib
 import functools
 import itertools
 import json
@@ -268,8 +269,11 @@ class FirstAnswer(Node):
         if not missing:
             self._report_shared()
         elif time.monotonic() - self._begin > MISSING:
+            names = [name for name, _ in (
+                *self.get_service_names_and_types(), *self.get_topic_names_and_types())]
             for name in missing:
-                self.complain(f'no replica has {name}')
+                near = difflib.get_close_matches(name, names, 3, 0.5) or ['nothing like it']
+                self.complain(f"no replica has {name}; the ROS graph has {', '.join(near)}")
 
     def _report_shared(self) -> None:
         """Warn once of names that the same node has on several machines."""

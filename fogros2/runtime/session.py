@@ -236,6 +236,11 @@ class Session:
 
     # -- processes ------------------------------------------------------------------------------
 
+    @property
+    def sent(self) -> list[NodeSpec]:
+        """The nodes that have started, or are about to."""
+        return [run.node for run in list(self._runs.values()) if run.state.phase != 'waiting']
+
     def command_here(self, resolve: Callable[[], list[str]]) -> Optional[list[str]]:
         """
         Return the command of a process on the robot, None if it stays on the machine.

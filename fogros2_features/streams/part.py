@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Optional
 
 import launch.logging
@@ -28,6 +28,8 @@ class Part(LaunchPart):
         #: By machine: the entries that were added.
         self._added: dict[str, list[StreamTopic]] = {}
         self._everywhere: list[tuple[Sequence[Entry], str]] = []
+        #: By machine: the topic names that the first loaded components got.
+        self._component_names: dict[str, dict[str, str]] = {}
         #: Machines whose links have the programs of limits.
         self._limited: set[str] = set()
         self._logger = launch.logging.get_logger('fogros2')
@@ -82,7 +84,9 @@ class Part(LaunchPart):
         streams = [entry for entry in self._all(own) if entry not in added]
         if not streams:
             return []
-        away = [name for name, one in self._launch.machines.items() if one.interrupted]
+        machines = self._launch.machines
+        away = [name for name, one in machines.items() if one.interrupted]
+        before = {name: self._streams.remappings(name) for name in machines}
         ends = {machine, *(entry.source for entry in streams if entry.source is not None)}
         for name in ends:
             self._streams.bandwidths[name] = self._policy(name).bandwidth
@@ -97,6 +101,9 @@ class Part(LaunchPart):
             _refuse(names, self._launch.spec(name).features.get('share', {}).get('share', ()),
                     f"share= of '{name}'", 'a stream gives it another name there')
         added += streams
+        # another machine may be the source
+        for name in machines:
+            self._warn_of_early(name, before[name])
         return [Program(spec, host, machine) for host, spec in new]
 
     def _refuse_apart(self, entry: StreamTopic, machine: str) -> None:
@@ -110,14 +117,43 @@ class Part(LaunchPart):
                 'of different robots do not reach each other',
                 'stream it to the robot, and from there by another name')
 
+    def _warn_of_early(self, machine: str, before: Mapping[str, str]) -> None:
+        names = self._streams.remappings(machine)
+        new = [name for name in names if name not in before]
+        early = [node.name for node in self._launch.machines[machine].sent
+                 if '--ros-args' in node.arguments] if new else []
+        if early:
+            self._logger.warning(
+                f"{machine}: {', '.join(early)} started before {', '.join(new)} became a "
+                'stream and get it unencoded; use a FogROSLaunchDescription, or add the stream to '
+                'the first node of the machine')
+        loaded = self._component_names.get(machine, names)
+        late = [name for name in names if name not in loaded]
+        if late:
+            self._logger.warning(
+                f"{machine}: components were loaded before {', '.join(late)} became a "
+                'stream and get it unencoded; add the stream to the container')
+            del self._component_names[machine]
+
     def starting(self, machine: str, nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
         """Rename the topics of nodes that have other names on the machine."""
-        names = self.names(machine)
+        names = {**self._policy(machine).names(machine), **self._streams.remappings(machine)}
+        without_arguments = [node.name for node in nodes if '--ros-args' not in node.arguments
+                             and node.package != 'fogros2']
+        if names and without_arguments:
+            self._logger.warning(
+                f"{machine}: {', '.join(without_arguments)} takes no ROS arguments and so "
+                f"does not use the new name or the stream of {', '.join(names)}; if it is a ROS "
+                "node that uses the topic, add '--ros-args' to its command")
         return [remapped(node, names) for node in nodes]
 
     def names(self, machine: str) -> dict[str, str]:
         """Return the new names of topics."""
-        return {**self._policy(machine).names(machine), **self._streams.remappings(machine)}
+        names = self._streams.remappings(machine)
+        loaded = self._component_names.setdefault(machine, names)
+        self._component_names[machine] = {
+            name: new for name, new in loaded.items() if name in names}
+        return {**self._policy(machine).names(machine), **names}
 
     def topics(self, own: Sequence[StreamTopic]) -> dict[str, bool]:
         """Return the streamed topics, and whether the robot publishes each."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import threading
 
 from launch import LaunchDescription
@@ -15,7 +16,7 @@ from launch.actions import (
     TimerAction,
 )
 from launch.conditions import IfCondition
-from launch.event_handlers import OnProcessStart
+from launch.event_handlers import OnProcessExit, OnProcessStart
 from launch.substitutions import LaunchConfiguration
 from launch.utilities import perform_substitutions
 from launch_ros.actions import (
@@ -182,6 +183,26 @@ def test_earlier_node_takes_the_stream_of_a_later_one(run, fake, planner):
             assert '/camera:=/fogros2/planner/camera' in node.arguments
 
 
+def test_node_that_runs_before_its_stream_is_named(run, fake, planner, caplog):
+    first = talker(planner, name='first')
+    late = talker(planner, stream_topics=[('/camera', 'h264')])
+    runs_on = CloudNode(machine=planner, package='demo', executable='talker', exec_name='early')
+
+    def on_start(machine, node):
+        own_ends(machine, node)
+        if 'decoder' in node.name:
+            for other in machine.all:
+                if other.name.startswith('early'):
+                    machine.say('exited', other, returncode=0, respawns=False)
+
+    fake.on_start = on_start
+    assert run(LaunchDescription([
+        runs_on, first,
+        RegisterEventHandler(OnProcessExit(target_action=first, on_exit=[late]))])) == 0
+    assert re.search(r'planner: early-\d+ started before /camera, /camera_info became a stream',
+                     caplog.text)
+
+
 def test_encoder_of_the_robot_waits_for_the_machine(run, fake, planner):
     ends_when_all_started(fake, 3)
     fake.waits['planner'] = go = threading.Event()
@@ -237,14 +258,19 @@ def test_unknown_source_of_a_stream_is_refused(run, fake, planner, capfd):
     assert not fake.noted('up')
 
 
-def test_program_without_ros_arguments_is_not_remapped(run, fake, planner):
+def test_program_without_ros_arguments_is_named(run, fake, planner, caplog):
+    """It may be a node that would take the raw images over the VPN; or ``sleep``."""
     ends_when_all_started(fake, 4)
     assert run(watched(fake, FogROSLaunchDescription, CloudGroup(planner, [
         ExecuteProcess(cmd=['true'], name='own_plain'),
         ExecuteProcess(cmd=['true', '--ros-args'], name='own_node'),
     ], stream_topics=[('/camera', 'h264')]))) == 0
+    said = [record.getMessage() for record in caplog.records
+            if 'takes no ROS arguments' in record.getMessage()]
+    assert len(said) == 1
+    assert re.match(
+        r'planner: own_plain(-\d+)? takes .* the stream of /camera, /camera_info', said[0])
     assert '/camera:=/fogros2/planner/camera' in rules(fake, 'planner', 'own_node')
-    assert rules(fake, 'planner', 'own_plain') == []
 
 
 class Loading(LoadComposableNodes):
@@ -273,7 +299,7 @@ def box(monkeypatch):
 
 
 @pytest.mark.parametrize('streams', ['group', 'launch'])
-def test_composable_nodes_get_their_streams(run, fake, planner, box, streams):
+def test_composable_nodes_get_their_streams(run, fake, planner, caplog, box, streams):
     """They are made by a service call, whose remappings are rewritten as a process's are."""
     ends_when_all_started(fake, 3)
     topics = [('/camera', 'h264')]
@@ -294,9 +320,10 @@ def test_composable_nodes_get_their_streams(run, fake, planner, box, streams):
         ('/camera_info', '/fogros2/planner/camera_info')],)
     # nothing of it stays, and what isn't loaded isn't looked at
     assert len(list(view.remappings)) == 2 and Loading.told[2] == []
+    assert not [record for record in caplog.records if 'components were' in record.getMessage()]
 
 
-def test_group_of_components_starts_their_streams(run, fake, planner, box):
+def test_group_of_components_starts_their_streams(run, fake, planner, box, caplog):
     """Into a container that another group has; its streams are known when they are loaded."""
     ends_when_all_started(fake, 3)
     load = Loading(ComposableNode(package='demo', plugin='demo::View', name='view'))
@@ -308,6 +335,7 @@ def test_group_of_components_starts_their_streams(run, fake, planner, box):
     assert Loading.told == 2 * ([
         ('/camera', '/fogros2/planner/camera'),
         ('/camera_info', '/fogros2/planner/camera_info')],)
+    assert not [record for record in caplog.records if 'components were' in record.getMessage()]
 
 
 def test_components_on_the_robot_have_streams_from_machines(run, fake, mapper):
@@ -335,6 +363,21 @@ def test_components_that_move_have_the_robots_names(run, fake, box, watch, how):
     assert Loading.told == ([('/costmap', '/fogros2/planner/costmap')], [])
 
 
+@pytest.mark.parametrize('condition', ['true', 'false'])
+def test_components_loaded_before_a_stream_are_named(
+        run, fake, planner, caplog, box, condition):
+    ends_when_all_started(fake, 4)
+    assert run(watched(
+        fake, FogROSLaunchDescription,
+        CloudGroup(planner, [box, Loading(
+            ComposableNode(package='demo', plugin='demo::View'),
+            condition=IfCondition(condition))]),
+        talker(planner, stream_topics=[('/camera', 'h264')]))) == 0
+    said = [record.getMessage() for record in caplog.records
+            if 'components were loaded before /camera, /camera_info' in record.getMessage()]
+    assert len(said) == (condition == 'true')
+
+
 def test_without_the_feature_its_keyword_is_unknown(run, fake, planner, monkeypatch):
     instead(monkeypatch, 'fogros2.feature', {})
     topics = [('/camera', 'h264')]
@@ -352,7 +395,8 @@ def test_group_without_processes_creates_no_machine(run, fake, planner):
     assert fake.notes == [] and fake.report is None
 
 
-def test_denied_and_limited_topics_are_renamed_on_their_machine(run, fake, mapper, box):
+def test_denied_and_limited_topics_are_renamed_on_their_machine(
+        run, fake, mapper, box, caplog):
     """Programs pass the limited ones at both ends; components have the names too."""
     ends_when_all_started(fake, 4)
     limited = ContainerInstance(name='planner', ros_workspace='', deny_topics=['/costmap'],
@@ -365,6 +409,7 @@ def test_denied_and_limited_topics_are_renamed_on_their_machine(run, fake, mappe
     names = {'/costmap': '/fogros2/planner/costmap', '/tf': '/fogros2/planner/tf'}
     assert rules(fake, 'planner')[-2:] == [f'{old}:={new}' for old, new in names.items()]
     assert Loading.told == ([*names.items()],) and rules(fake, 'mapper') == []
+    assert 'takes no ROS arguments' not in caplog.text
 
 
 @pytest.mark.parametrize(('keyword', 'value'), [
