@@ -131,7 +131,9 @@ class WireGuard(Vpn):
             lines.append(f'[ ! -e {noted} ] || {{ read -r _ before; '
                          f'set -- $({_FROM}); [ "$*" = "$before" ]; }} <{noted}')
         else:
-            lines += [_PATH, _look(name)]
+            # every tenth second only: it takes longer than all else here
+            lines += [_PATH, 'read -r up _ </proc/uptime',
+                      f'[ $((${{up%.*}} % 10)) != 0 ] || {_look(name)}']
             lines.append(f'found=$(wg show {name} endpoints) && '
                          f'{{ [ "$found" = "$(cat {noted} 2>/dev/null)" ] || '
                          f'printf "%s\\n" "$found" >{noted}; }} || :')

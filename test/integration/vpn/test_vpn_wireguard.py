@@ -297,7 +297,8 @@ def test_flushed_filter_is_noticed_and_repaired(vpn: Lab) -> None:
         assert complete(host)
         assert f'table inet {interface.name}' in vpn.shell(host, 'nft list tables')
     vpn.shell('machine', 'nft flush ruleset')
-    assert not vpn.alive('machine'), 'its agent looks each second'
+    wait_until(lambda: not vpn.alive('machine'), timeout=60,
+               what='a check of the agent in a tenth second')
 
 
 def test_machine_with_an_address_of_the_vpn_is_reported(lab: Lab) -> None:
