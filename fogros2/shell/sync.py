@@ -132,7 +132,7 @@ class RsyncShell(Shell):
         if failures:
             raise failures[0]
         room.measure()
-        if result.returncode != 0:
+        if result.returncode not in (0, VANISHED):
             lost = result.returncode in _LOST and 'No space left' not in result.stderr
             raise explained(result, Path(source), self.where if lost else process.HERE,
                             self.where)

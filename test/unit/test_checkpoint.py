@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import subprocess
 import sys
 
 import pytest
 
+from fogros2 import process
 from fogros2.describe.values import check_folder
 from fogros2.errors import ConfigurationError, ConnectError, DeadlineExceeded, ShellError
 from fogros2.model import Endpoint, Result
@@ -91,6 +93,19 @@ def test_copy_of_a_changing_folder_is_not_used(kept, folder, torn):
         kept.save(torn, still=False)
     assert kept.newest is None
     assert kept.save(torn, still=True), 'its node says that the files are consistent'
+
+
+def test_copy_from_which_a_file_vanishes_is_tried_again(
+        kept, folder, shell, tmp_path, monkeypatch):
+    """A node writes a file aside and renames it, so rsync exits with 24."""
+    (folder / 'map.tmp').write_text('half')
+    program = tmp_path / 'bin/rsync'
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\n{which("rsync")} "$@" || exit\n'
+                       f'! rm {folder}/map.tmp 2>/dev/null || exit 24\n')
+    program.chmod(0o755)
+    monkeypatch.setitem(process._ENVIRONMENT, 'PATH', f'{program.parent}:{os.environ["PATH"]}')
+    assert kept.save(shell, still=False) and texts(kept.newest) == {'parts/1': 'one'}
 
 
 @pytest.mark.parametrize('error', [ConnectError, DeadlineExceeded])
