@@ -114,7 +114,8 @@ class WireGuard(Vpn):
         Return the health check: a few milliseconds, and no root on the robot.
 
         A TUN has a carrier while a program has it open; a WireGuard interface of the kernel always
-        has one. Reading the carrier fails if the interface is missing or down.
+        has one. Reading the carrier fails if the interface is missing or down. Network managers
+        may remove addresses that they did not set: systemd-networkd does so at its restart.
 
         On the robot the check also fails when the source address of packets to a peer has changed:
         ``wireguard-go`` would use the old address for 15 s, and ``repair`` makes it look again.
@@ -125,14 +126,15 @@ class WireGuard(Vpn):
         """
         name, noted = _name(interface), _noted(interface)
         lines = [
-            f'read -r carrier 2>/dev/null </sys/class/net/{name}/carrier',
-            '[ "$carrier" = 1 ]']
+            _PATH, f'read -r carrier 2>/dev/null </sys/class/net/{name}/carrier',
+            '[ "$carrier" = 1 ]',
+            f'ip -4 -o address show dev {name} | grep -qF " {interface.address}/"']
         if interface.firewall:
             lines.append(f'[ ! -e {noted} ] || {{ read -r _ before; '
                          f'set -- $({_FROM}); [ "$*" = "$before" ]; }} <{noted}')
         else:
             # every tenth second only: it takes longer than all else here
-            lines += [_PATH, 'read -r up _ </proc/uptime',
+            lines += ['read -r up _ </proc/uptime',
                       f'[ $((${{up%.*}} % 10)) != 0 ] || {_look(name)}']
             lines.append(f'found=$(wg show {name} endpoints) && '
                          f'{{ [ "$found" = "$(cat {noted} 2>/dev/null)" ] || '

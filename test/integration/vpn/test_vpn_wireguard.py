@@ -301,6 +301,17 @@ def test_flushed_filter_is_noticed_and_repaired(vpn: Lab) -> None:
                what='a check of the agent in a tenth second')
 
 
+def test_removed_address_is_noticed_and_repaired(vpn: Lab) -> None:
+    """As systemd-networkd removes it when it starts again, from all links that it manages."""
+    for host, interface in vpn.interfaces.items():
+        assert vpn.alive(host)
+        vpn.shell(host, f'ip address flush dev {interface.name}')
+        assert not vpn.alive(host)
+        vpn.repair(host)
+        assert vpn.alive(host)
+    assert vpn.ping('machine', ROBOT)
+
+
 def test_machine_with_an_address_of_the_vpn_is_reported(lab: Lab) -> None:
     interface = dataclasses.replace(lab.interfaces['machine'], host_routes=True)
     peers = lab.peers()['machine']
