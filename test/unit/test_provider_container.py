@@ -234,6 +234,9 @@ def test_options_are_taken_as_they_are_meant(tmp_path):
     # not the 64 MB of the engines
     size = int(words[words.index('--shm-size') + 1])
     assert 0.49 < size / (os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE')) <= 0.5
+    # not the 2048 of podman
+    threads = int(words[words.index('--pids-limit') + 1])
+    assert 2048 < threads <= int(Path('/proc/sys/kernel/pid_max').read_text()) // 2
     # flags of podman alone, which docker refuses
     assert '--privileged' not in words and '--no-hosts' not in words
     assert not any(secret in ' '.join(words) for secret in ('AAAA', '0123-token'))

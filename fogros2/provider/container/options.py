@@ -152,6 +152,10 @@ def common_flags(
     yield from container_engine.limits()
     # as on every other computer, half of the memory: the engines' 64 MB end nodes by SIGBUS
     yield from ('--shm-size', str(os.sysconf('SC_PHYS_PAGES') // 2 * os.sysconf('SC_PAGE_SIZE')))
+    # podman's 2048 are too few for libraries with a thread for each of many processors
+    threads = min(int(Path('/proc/sys/kernel', name).read_text())
+                  for name in ('pid_max', 'threads-max'))
+    yield from ('--pids-limit', str(threads // 2))
     if options.network:
         yield from ('--network', options.network)
     if options.cpus:
