@@ -190,7 +190,7 @@ def test_options_reach_the_pod():
     assert container['resources']['limits'] == container['resources']['requests'] == {
         'cpu': '1500m', 'memory': '2048Mi', 'amd.com/gpu': '2'}
     assert container['env'] == [{'name': 'LANG', 'value': 'C.UTF-8'}]
-    assert pod['nodeSelector'] == {'pool': 'gpu'}
+    assert pod['nodeSelector'] == {'kubernetes.io/os': 'linux', 'pool': 'gpu'}
     assert pod['tolerations'] == [{'key': 'gpu', 'operator': 'Exists'}]
     assert pod['runtimeClassName'] == 'nvidia'
     assert pod['imagePullSecrets'] == [{'name': 'registry'}]
@@ -315,8 +315,8 @@ def test_architecture_is_that_of_the_matching_nodes(monkeypatch, options, nodes,
     class Cluster:
         def request(self, method, path, *, labelSelector, **words):
             assert (method, path) == ('GET', '/api/v1/nodes')
-            assert labelSelector == ','.join(
-                f'{k}={v}' for k, v in options.get('node_selector', {}).items())
+            assert labelSelector == ','.join(['kubernetes.io/os=linux', *(
+                f'{k}={v}' for k, v in options.get('node_selector', {}).items())])
             if isinstance(nodes, ApiError):
                 raise nodes
             return {'items': [{'metadata': {'labels': {'kubernetes.io/arch': arch}}}
@@ -491,6 +491,8 @@ def test_reason_of_the_end_is_found():
     ('ErrImagePull', 'unexpected status code https://registry-1.docker.io/v2/library/ros/manifests/'
      'sha256:e401: 429 Too Many Requests - Server message: toomanyrequests: You have reached your '
      'unauthenticated pull rate limit.', False, 'limits pulls without a login'),
+    ('ErrImagePull', 'failed to pull and unpack image "x": no match for platform in manifest: not '
+     'found', True, 'architecture'),
     ('InvalidImageName', "couldn't parse image reference", True, "no image's name"),
     ('CreateContainerConfigError', 'secret "x" not found', True, '')])
 def test_unavailable_image_is_reported(reason, message, final, word):

@@ -128,7 +128,7 @@ class KubernetesProvider(Provider):
             # Most users may not list nodes.
             with contextlib.suppress(ApiError):
                 nodes = items(api.request(
-                    'GET', path('nodes'), labelSelector=selector(options.node_selector),
+                    'GET', path('nodes'), labelSelector=selector(options.node_labels),
                     timeout=_FIRST, cancel=self.cancel))
                 architectures = {str((node['metadata'].get('labels') or {}).get(_ARCHITECTURE, ''))
                                  for node in nodes}

@@ -141,11 +141,11 @@ def of_image(reason: str, message: str, image: str) -> str:
     if re.search(r'unauthorized|authorization|denied|forbidden|credentials|401|403', text):
         return ('the registry wants a login, or has no such image: check container_image=, and '
                 'name the secret in image_pull_secrets=')
-    if re.search(r'not ?found|manifest unknown|does not exist|no such', text):
-        return 'check container_image=, its tag and its registry'
     if re.search(r'no match for platform|exec format|no matching manifest', text):
         return ("the image isn't made for the nodes' architecture: build it for theirs, or "
                 'choose nodes with node_selector=')
+    if re.search(r'not ?found|manifest unknown|does not exist|no such', text):
+        return 'check container_image=, its tag and its registry'
     if reason in ('ErrImagePull', 'ImagePullBackOff'):
         return 'can the nodes reach the registry?'
     if reason == 'CreateContainerConfigError':

@@ -91,15 +91,14 @@ def pod_spec(spec: MachineSpec, request: CreateRequest, options: Options) -> dic
     manifest: dict[str, Any] = {
         'restartPolicy': 'Never', 'automountServiceAccountToken': False,
         'enableServiceLinks': False, 'hostname': names.job_name(spec.name)[len('fogros2-'):],
-        'terminationGracePeriodSeconds': boot.GRACE, 'containers': [container]}
+        'terminationGracePeriodSeconds': boot.GRACE, 'nodeSelector': options.node_labels,
+        'containers': [container]}
     manifest['volumes'], container['volumeMounts'] = claims.mounts(request.with_volumes)
     # runtimes give 64 MB, which end nodes by SIGBUS; what is used counts to the pod's memory
     manifest['volumes'].append({'name': _SHM, 'emptyDir': {'medium': 'Memory'}})
     container['volumeMounts'].append({'name': _SHM, 'mountPath': '/dev/shm'})  # noqa: S108
     if request.application:
         manifest['containers'].append(_application(request.application, resources))
-    if options.node_selector:
-        manifest['nodeSelector'] = dict(options.node_selector)
     if options.tolerations:
         manifest['tolerations'] = [dict(each) for each in options.tolerations]
     if options.runtime_class:

@@ -65,6 +65,11 @@ class Options:
     env: Mapping[str, str] = dataclasses.field(default_factory=dict)
     annotations: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
+    @property
+    def node_labels(self) -> dict[str, str]:
+        """All required labels of the node; clusters may have Windows nodes without a taint."""
+        return {'kubernetes.io/os': 'linux', **self.node_selector}
+
     @classmethod
     def parse(cls, given: Mapping[str, Any]) -> Options:
         """
