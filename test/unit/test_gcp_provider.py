@@ -159,17 +159,24 @@ def test_disk_fits_the_image_and_the_type():
 ])
 def test_google_ends_the_machine_at_its_lifetime(on_exit, options, gpus, expected):
     spec = dataclasses.replace(SPEC, on_exit=on_exit)
-    found = instances.scheduling(spec, Options.parse(options), gpus=gpus)
+    found = instances.scheduling(spec, Options.parse(options), fixed=gpus)
     assert expected.items() <= found.items()
     assert found['automaticRestart'] is False
     if on_exit == 'keep':
         assert 'maxRunDuration' not in found
 
 
+@pytest.mark.parametrize(('kind', 'maintenance'), [
+    ('e2-medium', 'MIGRATE'), ('c3-highcpu-192', 'MIGRATE'), ('h4d-standard-192', 'TERMINATE'),
+    ('h3-standard-88', 'TERMINATE'), ('c3-highcpu-192-metal', 'TERMINATE')])
+def test_types_that_google_does_not_migrate_end(kind, maintenance):
+    assert body(kind=kind)['scheduling']['onHostMaintenance'] == maintenance
+
+
 @pytest.mark.parametrize(('lifetime', 'seconds'), [(1.0, '30'), (90.2, '91'), (1e9, '10368000')])
 def test_lifetime_is_within_googles_limits(lifetime, seconds):
     spec = dataclasses.replace(SPEC, lifetime=lifetime)
-    found = instances.scheduling(spec, Options(), gpus=False)
+    found = instances.scheduling(spec, Options(), fixed=False)
     assert found['maxRunDuration'] == {'seconds': seconds}
 
 

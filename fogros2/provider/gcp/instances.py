@@ -77,7 +77,8 @@ def insertion(
             'network': f'global/networks/{options.network}',
             **({'subnetwork': subnet} if subnet else {}),
             'accessConfigs': [{'name': 'External NAT', 'type': 'ONE_TO_ONE_NAT'}]}],
-        'scheduling': scheduling(order.spec, options, gpus=image['gpus']),
+        'scheduling': scheduling(
+            order.spec, options, fixed=image['gpus'] or is_fixed(place.kind)),
         'guestAccelerators': [
             {**gpu, 'acceleratorType': f'{zone}/acceleratorTypes/{gpu["acceleratorType"]}'}
             for gpu in options.gpus()],
@@ -88,11 +89,20 @@ def insertion(
     }
 
 
-def scheduling(spec: MachineSpec, options: Options, *, gpus: bool) -> dict[str, Any]:
-    """Return how Google places an instance, and when it ends it."""
+def is_fixed(kind: str) -> bool:
+    """Return whether Google migrates no instance of a type, with or without GPUs."""
+    return re.fullmatch(r'h\d.*|.*-metal', kind) is not None
+
+
+def scheduling(spec: MachineSpec, options: Options, *, fixed: bool) -> dict[str, Any]:
+    """
+    Return how Google places an instance, and when it ends it.
+
+    :param fixed: whether Google cannot migrate the instance, because of its type or GPUs.
+    """
     return {
         'automaticRestart': False,
-        'onHostMaintenance': 'TERMINATE' if options.spot or gpus else 'MIGRATE',
+        'onHostMaintenance': 'TERMINATE' if options.spot or fixed else 'MIGRATE',
         'provisioningModel': 'SPOT' if options.spot else 'STANDARD',
         **limit(spec, spot=options.spot, action='STOP' if spec.on_exit == 'stop' else 'DELETE')}
 
