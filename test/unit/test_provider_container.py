@@ -388,6 +388,19 @@ def test_limits_never_ask_for_more_than_there_is():
         assert int(hard) <= 1 << 22
 
 
+@pytest.mark.parametrize(('version', 'fits'), [
+    ('Server: Docker Engine - Community\n Engine:\n  Version: 28.2.2\n runc:\n', True),
+    ('Server: Docker Desktop 4.26.1 (131620)\n Engine:\n  Version: 24.0.7\n', False),
+    ('Server: Docker Engine - Community\n Engine:\n runc:\n rootlesskit:\n', False)])
+def test_docker_whose_network_is_elsewhere_is_refused(monkeypatch, version, fits):
+    monkeypatch.setattr(container_engine.process, 'run', lambda *_, **__: Result(0, version, ''))
+    if fits:
+        container_engine.answers(Engine('docker'))
+    else:
+        with pytest.raises(PrerequisiteError, match='no network that this computer reaches'):
+            container_engine.answers(Engine('docker'))
+
+
 @pytest.mark.parametrize('options', [
     {'memory': '2g'}, {'memory': '1.5GB'}, {'memory': '1048576'}, {'ports': ['8080:80/udp']},
     {'ports': ['80', '127.0.0.1:8080:80', '9000-9005:9000-9005']}])

@@ -230,9 +230,12 @@ def is_runtime_trouble(error: ProviderError) -> bool:
 
 def answers(engine: Engine) -> None:
     """
-    Check that the service of an engine runs, if it has one.
+    Check that the service of an engine runs on this computer, if it has one.
 
-    :raises PrerequisiteError: it does not run, or this user may not use it.
+    Docker Desktop runs containers in a virtual machine, and docker without root in a network
+    namespace: this computer can't reach their addresses there, nor filter their packets.
+
+    :raises PrerequisiteError: it does not run, or elsewhere, or this user may not use it.
     """
     if engine.name == 'docker':
         result = engine.call('version', what='asking docker', check=False)
@@ -240,6 +243,10 @@ def answers(engine: Engine) -> None:
             raise PrerequisiteError(
                 f'docker does not answer: {process.last_error(result.stderr)}',
                 sudo_hint(result.stderr) or 'sudo systemctl start docker')
+        if re.search('^Server: Docker Desktop|^ rootlesskit:', result.stdout, re.MULTILINE):
+            raise PrerequisiteError(
+                'Docker Desktop and rootless docker have no network that this computer reaches',
+                'sudo apt-get install podman, or run docker as root')
 
 
 def flags_for(*, unified: bool, systemd: bool, runc: bool) -> tuple[str, ...]:
