@@ -271,9 +271,6 @@ def _filter(interface: VpnInterface, ports: Sequence[tuple[int, int]]) -> _Step:
         f'    {outside} ip daddr {{ {interface.address}, {group} }} drop']
     if interface.firewall:
         rules += [
-            # an address of the LAN is known if it sends DDS from where an answer would go
-            f'    {outside} {_to(ports)} {RTPS} fib saddr . iif oif exists'
-            ' update @lan { ip saddr }' if ports else '',
             f'    iifname != "{name}" accept',
             # a peer may send to any address of this computer, a LAN's included
             f'    ip daddr != {destinations} drop',
@@ -323,7 +320,7 @@ def _confine(
 
     The group is a child of the group of the process, so that limits and systemd's units stay; but
     not of another launch's group, whose filter knows one VPN only. The step prints a line and does
-    not fail where control groups (version 2) cannot be used.
+    not fail where control groups (version 2) cannot be used, or the kernel lacks these rules.
 
     Other users can make control groups, with any name, in a group that is theirs. So the undo
     removes only the group whose path the step wrote into a file of root's. A group with groups
@@ -335,6 +332,13 @@ def _confine(
     match = f'{RTPS} socket cgroupv2 level %s "%s"'
     if interface.firewall:
         rules = [
+            # kernels may lack fib, too; after the filter, so that dropped packets do not count
+            *(['chain known {',
+               'type filter hook input priority filter + 1; policy accept;',
+               # an address of the LAN is known if it sends DDS from where an answer would go
+               f'{_outside(interface)} {_to(ports)} {RTPS} fib saddr . iif oif exists'
+               ' update @lan { ip saddr }',
+               '}'] if ports else []),
             'chain confined {',
             *([f'{_to(ports, "!= ")} drop',
                'oifname "lo" accept',

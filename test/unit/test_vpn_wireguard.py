@@ -56,6 +56,14 @@ def test_all_but_looking_needs_root() -> None:
     assert all(c.sudo for c in every_command(ROBOT, TO_MACHINE) if c != looks)
 
 
+def test_kernel_without_fib_or_socket_takes_the_filter() -> None:
+    """As WSL's was until 6.6.114: only the DDS of the launch's processes is not filtered there."""
+    robot = dataclasses.replace(ROBOT, process='1')
+    filters, confined = script(*WireGuard([(7400, 7649)]).up(robot, [])).split('confine() {')
+    for rule in ('fib saddr', 'socket cgroupv2'):
+        assert rule not in filters and rule in confined
+
+
 def test_full_disk_is_the_reason_that_the_key_is_not_written(tmp_path: Path) -> None:
     """``wg genkey`` ends well there, and ``wg pubkey`` would speak of the key's length."""
     (tmp_path / 'wg').write_text('#!/bin/sh\n')
