@@ -165,8 +165,10 @@ def test_full_disk_of_a_machine_is_named(one, tmp_path):
     source.mkdir()
     with open(source / 'big', 'wb') as file:
         file.truncate(80 << 20)
+    # the engine's /dev has 64 MB
+    shell.run(Command(('install', '-d', '-m', '1777', '/dev/small'), sudo=True), timeout=60.0)
     with pytest.raises(ShellError, match=f"disk of '{machine.name}' is full"):
-        shell.sync(source, '/dev/shm/x', excludes=[], timeout=60.0)
+        shell.sync(source, '/dev/small/x', excludes=[], timeout=60.0)
 
 
 def agent_config(*, robot_timeout, boot_timeout):

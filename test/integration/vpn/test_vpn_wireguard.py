@@ -168,7 +168,7 @@ def test_up_again_changes_nothing_and_keeps_the_session(shared: Lab) -> None:
     assert vpn.ping('robot', MACHINE)
     assert handshakes() == before
     assert vpn.shell('robot', f'nft list table inet {vpn.interfaces["robot"].name}').count(
-        'chain ') == 5
+        'chain ') == 6
 
 
 def test_up_with_another_filter_keeps_the_known_lan(shared: Lab) -> None:
